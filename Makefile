@@ -1,0 +1,62 @@
+# `make demo` and `make test` set up all they need on a fresh Debian 12, once, and then do their work.
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+PIP := $(VENV)/bin/pip install --quiet --disable-pip-version-check
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+DEBIAN := redis-server cmake ninja-build g++ libopenvdb-dev libboost-dev libboost-iostreams-dev \
+	libimath-dev libopenexr-dev libopenimageio-dev libtbb-dev libgtest-dev libbenchmark-dev \
+	clang-format python3-venv python3-dev
+CORE := $(shell find core -type f -not -path '*/build/*' -not -name '*.pyc')
+JOBS := $(shell nproc)
+
+.PHONY: demo test test-slow lint setup clean
+
+demo: setup
+	$(PYTHON) -m pileus_worker.demo
+
+test: setup build/.built
+	ctest --test-dir build --output-on-failure
+	$(PYTHON) -m pytest
+
+test-slow: setup build/.built
+	ctest --test-dir build --output-on-failure
+	$(PYTHON) -m pytest -m ''
+
+lint: setup
+	$(VENV)/bin/ruff check service worker tests
+	$(VENV)/bin/ruff format --check service worker tests
+	$(VENV)/bin/mypy
+	find core -name '*.cpp' -o -name '*.h' | xargs clang-format --dry-run --Werror
+
+setup: $(VENV)/.system $(VENV)/.core $(VENV)/.pileus
+
+$(VENV)/.system: Makefile
+	@for package in $(DEBIAN); do \
+	    dpkg-query -W -f '$${Status}\n' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+	done; \
+	if [ -n "$$missing" ]; then \
+	    $(SUDO) apt-get update -qq && \
+	    $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing; \
+	fi
+	@mkdir -p $(VENV) && touch $@
+
+$(VENV)/.venv: $(VENV)/.system
+	test -x $(PYTHON) || python3 -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.core: $(CORE) $(VENV)/.venv
+	CMAKE_BUILD_PARALLEL_LEVEL=$(JOBS) $(PIP) ./core
+	@touch $@
+
+$(VENV)/.pileus: pyproject.toml $(VENV)/.core
+	$(PIP) --editable '.[worker,dev]'
+	@touch $@
+
+build/.built: $(CORE) $(VENV)/.system
+	cmake -S core -B build -G Ninja
+	cmake --build build --parallel $(JOBS)
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build demo

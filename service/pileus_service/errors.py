@@ -1,0 +1,27 @@
+"""The errors that a user can mend; each message is the one line that reaches them."""
+
+from pydantic import ValidationError
+
+
+class InputError(ValueError):
+    """Wrong input: the message names the file, the field and the mend (exit code 2)."""
+
+
+class FarmError(RuntimeError):
+    """The work failed although the input was right (exit code 1)."""
+
+
+def one_line(source: str, error: ValidationError) -> str:
+    """The first trouble of a validation error as one line, with a count of the others."""
+    first, *others = error.errors(include_url=False)
+    # The tag of a union member ("distant") is part of pydantic's location, not of the file's.
+    parts = [str(part) for part in first["loc"] if part not in _UNION_TAGS]
+    where = ".".join(parts)
+    message = first["msg"].removeprefix("Value error, ")
+    value = first["input"]
+    shown = f" = {value!r:.80}" if isinstance(value, str | int | float) and where else ""
+    more = f" (and {len(others)} more)" if others else ""
+    return f"{source}: {where}{shown}: {message}{more}" if where else f"{source}: {message}{more}"
+
+
+_UNION_TAGS = {"distant", "dome", "constant", "keyed"}

@@ -1,0 +1,112 @@
+"""Reads shots from TOML or JSON files, with `--set section.key=value` overrides."""
+
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pileus_service.errors import InputError, one_line
+from pileus_service.frames import has_pattern
+from pileus_service.shot import Shot
+
+MAX_BYTES = 1 << 20
+
+
+def load_shot(path: Path, sets: Sequence[str] = ()) -> Shot:
+    """The shot of a file, its paths absolute; any trouble is one line about the file."""
+    data = _read(path)
+    for setting in sets:
+        _override(data, setting)
+    return parse_shot(data, str(path)).anchored(path.resolve().parent)
+
+
+def parse_shot(data: Any, source: str) -> Shot:
+    try:
+        return Shot.model_validate(data)
+    except ValidationError as error:
+        raise InputError(one_line(source, error)) from None
+
+
+def check_files(shot: Shot, source: str, frames: Iterable[int]) -> None:
+    """Refuses a shot whose inputs are missing or whose output cannot be written."""
+    frames = list(frames)
+    missing: dict[str, list[Path]] = {}
+    for frame in frames:
+        for field, file in shot.inputs(frame):
+            if not file.is_file():
+                missing.setdefault(field, []).append(file)
+    for field, files in missing.items():
+        name = files[0]
+        if len(files) < len(frames) and has_pattern(dict(_patterns(shot))[field]):
+            raise InputError(
+                f"{source}: {field}: the sequence has a gap of {len(files)} of {len(frames)} "
+                f"frames, first {name}; make the file or leave the frame out of `frames`"
+            )
+        raise InputError(f"{source}: {field}: no such file {name}; mend the path")
+    for frame in frames:
+        _check_writable(shot.output(frame), source)
+
+
+def _patterns(shot: Shot) -> Iterable[tuple[str, str]]:
+    yield from ((f"volumes.{i}.cache", volume.cache) for i, volume in enumerate(shot.volumes))
+    for index, light in enumerate(shot.lights):
+        if light.type == "dome" and light.texture:
+            yield f"lights.{index}.texture", light.texture
+
+
+def _check_writable(output: Path, source: str) -> None:
+    folder = next(parent for parent in output.parents if parent.exists())
+    if output.is_dir():
+        raise InputError(f"{source}: image.output: {output} is a folder; name a file")
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{source}: image.output: cannot write in {folder}; choose another place")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: over {MAX_BYTES} bytes; is this a shot?")
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise InputError(
+            f"{path}: {(error.strerror or 'unreadable').lower()}; mend the path"
+        ) from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise InputError(f"{path}: is not {kind}: {error}") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: a shot is a table of name, frames, image, ...")
+    return data
+
+
+def _override(data: dict[str, Any], setting: str) -> None:
+    key, equals, text = setting.partition("=")
+    steps = key.strip().split(".")
+    if not equals or not all(steps):
+        raise InputError(f"--set {setting}: write section.key=value")
+    try:
+        value = tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = text  # a bare word: a method, a path, a frame range
+    here: Any = data
+    for index, step in enumerate(steps):
+        last = index == len(steps) - 1
+        if isinstance(here, list):
+            if not step.isdecimal() or int(step) >= len(here):
+                raise InputError(f"--set {setting}: {step!r} is no index below {len(here)}")
+            if last:
+                here[int(step)] = value
+            else:
+                here = here[int(step)]
+        elif isinstance(here, dict):
+            if last:
+                here[step] = value
+            else:
+                here = here.setdefault(step, {})
+        else:
+            raise InputError(f"--set {setting}: {'.'.join(steps[:index])} has nothing inside it")
