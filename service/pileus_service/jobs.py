@@ -1,0 +1,204 @@
+"""What the service and the workers say to each other: jobs, frames, tasks and their results."""
+
+import hashlib
+import re
+import secrets
+import time
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from pileus_service.shot import Shot
+
+Priority = Annotated[int, Field(ge=0, le=9)]
+JOB_ID = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+JobId = Annotated[str, StringConstraints(pattern=rf"^{JOB_ID.pattern}$")]
+Bucket = tuple[int, int, int, int]
+TERMINAL = frozenset({"done", "failed", "cancelled"})
+
+
+class Record(BaseModel):
+    """A message or a file of the farm's own."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class JobState(StrEnum):
+    QUEUED = "queued"
+    RUNNING = "running"
+    PAUSED = "paused"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+    DONE = "done"
+
+
+class Kind(StrEnum):
+    PLAN = "plan"
+    RENDER = "render"
+    MERGE = "merge"
+
+
+class Job(Record):
+    """A job as it was submitted: job.json."""
+
+    id: JobId
+    created: float
+    shot: Shot
+
+
+class Wish(Record):
+    """What is wanted of a job and how it ended: state.json, written by the service alone."""
+
+    state: Literal["running", "paused", "cancelled", "failed", "done"] = "running"
+    priority: Priority = 5
+    finished: float | None = None
+    failed: dict[int, str] = {}
+
+
+class Cache(Record):
+    """A cache file as it was when its frame was planned."""
+
+    path: str
+    mtime_ns: int
+    size: int
+
+
+class Part(Record):
+    """A render task: samples [first, last) of a bucket of pixels."""
+
+    bucket: Bucket
+    samples: tuple[int, int]
+
+    @property
+    def name(self) -> str:
+        return "-".join(map(str, self.bucket)) + ".{}-{}.exr".format(*self.samples)
+
+    @property
+    def pixel_samples(self) -> int:
+        x0, y0, x1, y1 = self.bucket
+        return (x1 - x0) * (y1 - y0) * (self.samples[1] - self.samples[0])
+
+
+class Plan(Record):
+    """How a frame is rendered: plan.json. The empty buckets are left to the merge."""
+
+    frame: int
+    identity: str
+    cache: Cache
+    parts: list[Part]
+    empty: list[Bucket]
+    seconds: float
+
+
+class Done(Record):
+    """A frame that is finished: done.json, written after the image and before any clean-up."""
+
+    frame: int
+    file: str
+    seconds: float
+    samples: int
+    method: str
+    max_bounces: int | None
+    reason: str
+
+
+class Task(Record):
+    """A task that a worker holds the lease of. `frame` is an index into the shot's frames."""
+
+    priority: Priority
+    entry: str
+    attempt: int
+    job: JobId
+    frame: int
+    kind: Kind
+    part: int
+
+    def __str__(self) -> str:
+        part = f" {self.part}" if self.kind is Kind.RENDER else ""
+        return f"{self.job} frame[{self.frame}] {self.kind}{part}"
+
+
+class Planned(Record):
+    """A plan's result; parts already on disk are finished and not rendered again."""
+
+    tasks: int
+    finished: list[int]
+    total: int
+    samples: int
+
+
+class Rendered(Record):
+    samples: int
+
+
+class Merged(Record):
+    """A merge's result: parts to render again because they are missing or damaged, if any."""
+
+    redo: list[int] = []
+    reason: str = ""
+
+
+Result = Planned | Rendered | Merged
+
+
+class WorkerInfo(Record):
+    """A worker as it describes itself with every renewal."""
+
+    name: str
+    host: str
+    pid: int
+    threads: int
+    started: float
+    task: Task | None = None
+    samples: int = 0
+
+
+class WorkerView(WorkerInfo):
+    """A worker as the service shows it."""
+
+    seen: float
+    alive: bool
+
+
+class FrameView(Record):
+    """A frame as the service shows it."""
+
+    frame: int
+    state: Literal["waiting", "planning", "rendering", "merging", "done", "failed", "cancelled"]
+    tasks: int = 0
+    tasks_done: int = 0
+    progress: float = 0.0
+    reason: str | None = None
+    file: str | None = None
+    seconds: float | None = None
+
+
+class JobView(Record):
+    """A job as the service shows it."""
+
+    id: JobId
+    name: str
+    state: JobState
+    priority: Priority
+    frames: int
+    frames_done: int
+    frames_failed: int
+    progress: float
+    samples: int
+    tasks: int
+    created: float
+    started: float | None = None
+    finished: float | None = None
+    seconds_left: float | None = None
+    reason: str | None = None
+
+
+def new_id() -> str:
+    """An id that sorts by time and cannot be guessed from another."""
+    return time.strftime("%Y%m%d-%H%M%S-", time.gmtime()) + secrets.token_hex(4)
+
+
+def id_for_key(key: str) -> str:
+    """The id of a submission with an idempotency key: the same key is the same job."""
+    return "key-" + hashlib.sha256(key.encode()).hexdigest()[:24]

@@ -1,0 +1,19 @@
+-- The worker ARGV[2] gives up the entry ARGV[4] of priority ARGV[3], to be taken by another at once.
+-- With a reason ARGV[5] its attempt failed; without one it is handed back and the attempt is
+-- not counted. Returns 'released', 'parked', or 'lost' if it was not the worker's any more.
+local worker, stream, id, reason = ARGV[2], stream_of(ARGV[3]), ARGV[4], ARGV[5]
+local pending = owned(stream, id, worker)
+if not pending then return 'lost' end
+local attempts = pending[4]
+if reason == '' then
+  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'RETRYCOUNT', attempts - 1, 'JUSTID')
+  return 'released'
+end
+record_try(stream, id, worker, reason)
+local task = read(stream, id)
+if wanted(task) and verdict(stream, id, attempts, worker) == 'park' then
+  park(stream, id, task)
+  return 'parked'
+end
+redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'JUSTID')
+return 'released'

@@ -1,0 +1,13 @@
+-- Takes a job in (once): ARGV[3] its fields as JSON, with the frames that are done or failed.
+local job, given = ARGV[2], cjson.decode(ARGV[3])
+local key = job_of(job)
+if redis.call('EXISTS', key) == 1 then return 0 end
+redis.call('HSET', key, 'name', given.name, 'state', given.state, 'priority', given.priority,
+  'frames', given.frames, 'created', given.created, 'gen', redis.call('INCR', 'pileus:gen'), 'next', 0, 'out', 0,
+  'done', #given.done, 'samples', 0, 'tasks', 0)
+if type(given.finished) == 'number' then redis.call('HSET', key, 'finished', given.finished) end
+for _, frame in ipairs(given.done) do redis.call('SETBIT', key .. ':done', frame, 1) end
+for frame, reason in pairs(given.failed) do redis.call('HSET', key .. ':failed', frame, reason) end
+redis.call('ZADD', 'pileus:jobs', given.created, job)
+if given.state == 'running' then advance(job) end
+return 1

@@ -1,0 +1,136 @@
+"""The farm's truth: a folder of jobs, their plans, partials and done markers.
+
+Every file is written whole or not at all, so what is there can be trusted after any crash, and
+Redis can be rebuilt from it. Layout: jobs/ID/{job.json,state.json}, jobs/ID/frames/NNNNNN/
+{plan.json,preview.png,done.json,parts/BUCKET.SAMPLES.exr}.
+"""
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import ValidationError
+
+from pileus_service.jobs import JOB_ID, Done, Job, Part, Plan, Record, Wish
+
+R = TypeVar("R", bound=Record)
+
+
+def write_whole(path: Path, data: bytes, *, once: bool = False) -> bool:
+    """Writes through a temporary file; with `once`, the first writer wins (else returns False)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    try:
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if once:
+            os.link(temporary, path)
+        else:
+            temporary.replace(path)
+    except FileExistsError:
+        return False
+    finally:
+        temporary.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+    return True
+
+
+class FrameStore:
+    """The files of one frame of a job."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.preview = folder / "preview.png"
+
+    def part(self, part: Part) -> Path:
+        return self.folder / "parts" / part.name
+
+    def plan(self) -> Plan | None:
+        return _read(self.folder / "plan.json", Plan)
+
+    def keep_plan(self, plan: Plan) -> Plan:
+        """Keeps the first plan that is made; returns the one that holds."""
+        write_whole(self.folder / "plan.json", plan.model_dump_json().encode(), once=True)
+        return self.plan() or plan
+
+    def drop_plan(self) -> None:
+        """Forgets plan and partials, where the cache has changed under them."""
+        (self.folder / "plan.json").unlink(missing_ok=True)
+        self.drop_parts()
+
+    def done(self) -> Done | None:
+        return _read(self.folder / "done.json", Done)
+
+    def mark_done(self, done: Done) -> None:
+        write_whole(self.folder / "done.json", done.model_dump_json().encode())
+
+    def drop_parts(self) -> None:
+        shutil.rmtree(self.folder / "parts", ignore_errors=True)
+
+
+class Store:
+    """The data folder, shared by the service and all workers."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.jobs_folder = root / "jobs"
+        self.jobs_folder.mkdir(parents=True, exist_ok=True)
+
+    def create(self, job: Job, wish: Wish) -> bool:
+        """Keeps a new job; False where one of its id is there already."""
+        folder = self._folder(job.id)
+        if not (folder / "state.json").exists():
+            self.wish(job.id, wish)
+        return write_whole(folder / "job.json", job.model_dump_json().encode(), once=True)
+
+    def job(self, job_id: str) -> Job | None:
+        return _read(self._folder(job_id) / "job.json", Job)
+
+    def job_ids(self) -> Iterator[str]:
+        for folder in sorted(self.jobs_folder.iterdir()):
+            if JOB_ID.fullmatch(folder.name) and (folder / "job.json").exists():
+                yield folder.name
+
+    def wish(self, job_id: str, wish: Wish) -> None:
+        write_whole(self._folder(job_id) / "state.json", wish.model_dump_json().encode())
+
+    def wished(self, job_id: str) -> Wish:
+        return _read(self._folder(job_id) / "state.json", Wish) or Wish()
+
+    def frame(self, job_id: str, frame: int) -> FrameStore:
+        return FrameStore(self._folder(job_id) / "frames" / f"{frame:06d}")
+
+    def done_frames(self, job: Job) -> list[int]:
+        """The indices of the frames whose done marker is there."""
+        marks = {path.parent.name for path in self._folder(job.id).glob("frames/*/done.json")}
+        return [i for i, n in enumerate(job.shot.frame_numbers) if f"{n:06d}" in marks]
+
+    def remove(self, job_id: str) -> None:
+        """Forgets a job; its images, which lie outside, stay."""
+        folder = self._folder(job_id)
+        with contextlib.suppress(FileNotFoundError):
+            (folder / "job.json").unlink()
+        shutil.rmtree(folder, ignore_errors=True)
+
+    def _folder(self, job_id: str) -> Path:
+        if not JOB_ID.fullmatch(job_id):
+            raise ValueError(f"{job_id!r} is no job id")
+        return self.jobs_folder / job_id
+
+
+def _read(path: Path, kind: type[R]) -> R | None:
+    """The record of a file; a damaged one counts as absent, so that it is made again."""
+    try:
+        return kind.model_validate_json(path.read_bytes())
+    except (FileNotFoundError, NotADirectoryError, ValidationError):
+        return None

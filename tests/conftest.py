@@ -1,0 +1,48 @@
+"""What the tests share: a real Redis for each test process, a shot to vary."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from redis import Redis
+
+from pileus_service.queue import connect
+from pileus_worker.private_redis import PrivateRedis
+
+
+@pytest.fixture(scope="session")
+def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with PrivateRedis(tmp_path_factory.mktemp("redis")) as server:
+        yield server.url
+
+
+@pytest.fixture
+def redis(redis_url: str) -> Iterator[Redis]:
+    with connect(redis_url) as client:
+        client.flushall()
+        yield client
+
+
+@pytest.fixture
+def shot(tmp_path: Path) -> dict[str, Any]:
+    """A small right shot whose cache does not exist yet."""
+    return {
+        "name": "test",
+        "frames": "1-3",
+        "image": {"width": 48, "height": 32, "output": str(tmp_path / "out" / "test.####.exr")},
+        "volumes": [
+            {
+                "cache": str(tmp_path / "caches" / "cloud.####.vdb"),
+                "extinction": 20.0,
+                "anisotropy": 0.5,
+            }
+        ],
+        "camera": {"position": [0.15, 0.12, 1.9], "look_at": [0.0, 0.02, 0.0], "fov": 35.0},
+        "lights": [
+            {"type": "distant", "direction": [0.6, -0.55, -0.58], "irradiance": [3.0, 3.0, 3.0]},
+            {"type": "dome", "radiance": [0.3, 0.35, 0.4]},
+        ],
+        "transport": {"method": "multiple", "max_bounces": 4},
+        "sampling": {"samples": 4, "seed": 7},
+    }

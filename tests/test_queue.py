@@ -1,0 +1,293 @@
+"""The queue's promises, each against a real Redis: leases, attempts, order, pause, cancel, once."""
+
+import time
+from collections.abc import Callable
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from redis import Redis
+
+from pileus_service.jobs import Kind, Merged, Planned, Rendered, Task, Wish, WorkerInfo
+from pileus_service.queue import Queue
+
+LEASE = 0.25
+
+
+def worker(name: str) -> WorkerInfo:
+    return WorkerInfo(name=name, host="host", pid=1, threads=1, started=0.0)
+
+
+A, B, C, D = (worker(name) for name in "ABCD")
+
+
+@pytest.fixture
+def queue(redis: Redis) -> Queue:
+    return Queue(redis, lease=LEASE)
+
+
+def submit(queue: Queue, job: str = "job", frames: int = 1, priority: int = 5) -> None:
+    assert queue.submit(job, job, time.time(), frames, Wish(priority=priority))
+
+
+def planned(tasks: int, finished: list[int] | None = None) -> Planned:
+    return Planned(tasks=tasks, finished=finished or [], total=tasks * 10, samples=0)
+
+
+def take(queue: Queue, info: WorkerInfo = A) -> Task:
+    task = queue.claim(info)
+    assert task is not None
+    return task
+
+
+def do(queue: Queue, task: Task, info: WorkerInfo = A, tasks: int = 3) -> bool:
+    """Completes a task as a worker would, each plan with so many tasks."""
+    results: dict[Kind, Planned | Rendered | Merged] = {
+        Kind.PLAN: planned(tasks),
+        Kind.RENDER: Rendered(samples=10),
+        Kind.MERGE: Merged(),
+    }
+    return queue.complete(task, info.name, results[task.kind])
+
+
+def view(queue: Queue, job: str = "job") -> tuple[str, int, int]:
+    seen = queue.job(job)
+    assert seen is not None
+    return seen.state, seen.frames_done, seen.frames_failed
+
+
+def lapse() -> None:
+    time.sleep(LEASE * 1.2)
+
+
+def test_a_job_goes_from_plan_to_done(queue: Queue) -> None:
+    submit(queue, frames=2)
+    assert view(queue) == ("queued", 0, 0)
+    kinds = []
+    while task := queue.claim(A):
+        kinds.append(task.kind)
+        assert do(queue, task)
+    assert kinds.count(Kind.PLAN) == 2
+    assert kinds.count(Kind.RENDER) == 6
+    assert kinds.count(Kind.MERGE) == 2
+    assert view(queue) == ("done", 2, 0)
+
+
+def test_an_expired_lease_goes_to_another_and_the_thawed_worker_cannot_take_it_back(
+    queue: Queue,
+) -> None:
+    submit(queue)
+    frozen = take(queue, A)
+    assert queue.claim(B) is None
+    lapse()
+    again = take(queue, B)
+    assert (again.entry, again.attempt) == (frozen.entry, 2)
+    assert not queue.renew(frozen, A)
+    assert not do(queue, frozen, A)
+    assert queue.fail(frozen, "A", "late") == "lost"
+    assert queue.renew(again, B)
+    assert do(queue, again, B)
+
+
+def test_renewal_keeps_the_lease_and_the_attempt_count(queue: Queue) -> None:
+    submit(queue)
+    task = take(queue, A)
+    for _ in range(5):
+        time.sleep(LEASE / 2)
+        assert queue.renew(task, A)
+        assert queue.claim(B) is None
+    lapse()
+    assert take(queue, B).attempt == 2
+
+
+def test_three_failed_attempts_on_distinct_workers_park_the_task_and_fail_its_frame(
+    queue: Queue,
+) -> None:
+    submit(queue, frames=1)
+    for info in (A, B, C, D):
+        queue.claim(info)  # makes itself known; A gets the task
+    task = Task(
+        priority=5, entry=_entry(queue), attempt=1, job="job", frame=0, kind=Kind.PLAN, part=0
+    )
+    assert queue.fail(task, "A", "no grid") == "released"
+    assert queue.claim(A) is None, "the same worker tries again only where no other lives"
+    assert take(queue, B).attempt == 2
+    assert queue.fail(task, "B", "no grid") == "released"
+    assert queue.claim(B) is None
+    assert take(queue, C).attempt == 3
+    assert queue.fail(task, "C", "no memory") == "parked"
+    assert queue.claim(D) is None
+    assert view(queue) == ("failed", 0, 1)
+    assert queue.failed("job") == {0: "plan failed: A: no grid; B: no grid; C: no memory"}
+
+
+def _entry(queue: Queue) -> str:
+    [pending] = queue.redis.xpending_range("pileus:tasks:5", "workers", "-", "+", 2)
+    return str(pending["message_id"])
+
+
+def test_a_lone_worker_makes_all_three_attempts(queue: Queue) -> None:
+    submit(queue, frames=2)
+    for outcome in ("released", "released", "parked"):
+        task = take(queue)
+        assert task.frame == 0
+        assert queue.fail(task, "A", "crashed") == outcome
+    assert take(queue).frame == 1, "the next frame goes on"
+
+
+def test_a_worker_lost_three_times_over_parks_the_task_too(queue: Queue) -> None:
+    submit(queue)
+    for info in (A, B, C):
+        take(queue, info)
+        lapse()
+    assert queue.claim(D) is None
+    reason = queue.failed("job")[0]
+    assert reason == "plan failed: A: stopped answering; B: stopped answering; C: stopped answering"
+
+
+def test_a_task_handed_back_counts_no_attempt(queue: Queue) -> None:
+    submit(queue)
+    for _ in range(5):
+        task = take(queue)
+        assert task.attempt == 1
+        queue.hand_back(task, "A")
+
+
+def test_higher_priority_goes_first_and_a_change_moves_waiting_tasks_once(queue: Queue) -> None:
+    submit(queue, "low", frames=4, priority=2)
+    submit(queue, "high", frames=1, priority=8)
+    assert take(queue).job == "high"
+    submit(queue, "middle", frames=1, priority=5)
+    for priority in (9, 2, 9):
+        queue.control("low", "priority", priority)
+    order = [(task.job, task.frame) for task in iter(lambda: queue.claim(A), None)]
+    assert order == [("low", 0), ("low", 1), ("middle", 0)]
+
+
+def test_pause_holds_every_task_and_resume_lets_them_go_once(queue: Queue) -> None:
+    submit(queue, frames=3)
+    do(queue, take(queue), tasks=3)
+    queue.control("job", "pause")
+    assert queue.claim(A) is None
+    assert view(queue)[0] == "paused"
+    queue.control("job", "resume")
+    assert (
+        len([task for task in iter(lambda: queue.claim(A), None) if task.kind is Kind.RENDER]) == 3
+    )
+
+
+def test_cancel_drops_waiting_tasks_and_is_seen_by_running_ones(queue: Queue) -> None:
+    submit(queue, frames=3)
+    running = take(queue)
+    queue.control("job", "cancel")
+    assert queue.state("job") == "cancelled"
+    assert queue.claim(B) is None
+    assert do(queue, running)
+    assert view(queue) == ("cancelled", 0, 0)
+    assert queue.depths() == {5: (0, 0)}
+
+
+def test_completion_counts_once_however_often_a_task_was_done(queue: Queue) -> None:
+    submit(queue)
+    do(queue, take(queue), tasks=2)
+    first = take(queue, A)
+    lapse()
+    second = take(queue, B)
+    assert do(queue, second, B)
+    assert not do(queue, first, A)
+    assert not do(queue, second, B)
+    seen = queue.job("job")
+    assert seen is not None
+    assert (seen.samples, seen.tasks) == (10, 2)
+
+
+def test_a_damaged_partial_is_rendered_again_a_bounded_number_of_times(queue: Queue) -> None:
+    submit(queue)
+    do(queue, take(queue), tasks=3)
+    for _ in range(3):
+        do(queue, take(queue))
+    for _ in range(4):
+        merge = take(queue)
+        assert merge.kind is Kind.MERGE
+        queue.complete(merge, "A", Merged(redo=[1], reason="part 1 is damaged"))
+        task = queue.claim(A)
+        if task:
+            assert (task.kind, task.part) == (Kind.RENDER, 1)
+            do(queue, task)
+    assert queue.failed("job") == {0: "merge failed: part 1 is damaged"}
+
+
+def test_parts_found_on_disk_are_not_issued(queue: Queue) -> None:
+    submit(queue)
+    queue.complete(take(queue), "A", planned(4, finished=[0, 2, 3]))
+    task = take(queue)
+    assert (task.kind, task.part) == (Kind.RENDER, 1)
+    do(queue, task)
+    assert take(queue).kind is Kind.MERGE
+
+
+def test_a_million_tasks_hold_little_in_redis(queue: Queue, redis: Redis) -> None:
+    submit(queue, frames=100)
+    do(queue, take(queue), tasks=10_000)
+    assert queue.depths()[5][0] <= 10
+    assert sum(redis.memory_usage(key) or 0 for key in redis.scan_iter()) < 100_000
+
+
+def test_lag_stays_true_for_scalers(queue: Queue, redis: Redis) -> None:
+    submit(queue, frames=4, priority=3)
+    do(queue, take(queue))
+    queue.control("job", "priority", 6)
+    [group] = redis.xinfo_groups("pileus:tasks:6")
+    waiting = redis.xlen("pileus:tasks:6")
+    assert group["lag"] == waiting > 0
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 9)), max_size=60))
+def test_whatever_happens_every_frame_ends_and_nothing_is_left(
+    redis: Redis, steps: list[tuple[str, int]]
+) -> None:
+    """Workers claim, finish, hand back, freeze and are taken for dead in any order."""
+    redis.flushall()
+    queue = Queue(redis, lease=0.01)
+    submit(queue, "one", frames=3)
+    submit(queue, "two", frames=2, priority=7)
+    held: dict[str, list[Task]] = {"A": [], "B": [], "C": []}
+    actions: dict[int, Callable[[Task, WorkerInfo], object]] = {
+        0: lambda task, info: queue.hand_back(task, info.name),
+        1: lambda task, info: queue.fail(task, info.name, "crash"),
+        2: lambda task, info: time.sleep(0.015),
+    }
+
+    def finish(task: Task, info: WorkerInfo) -> object:
+        return do(queue, task, info)
+
+    for name, action in steps:
+        info = worker(name)
+        if action == 9:
+            queue.control("one", "pause")
+            queue.control("one", "resume")
+        elif action == 8:
+            queue.control("one", "priority", len(held[name]) % 10)
+        elif held[name] and action < 7:
+            act = actions.get(action, finish)
+            act(held[name].pop(), info)
+        elif task := queue.claim(info):
+            held[name].append(task)
+    deadline = time.monotonic() + 10
+    while any(view(queue, job)[0] not in ("done", "failed") for job in ("one", "two")):
+        assert time.monotonic() < deadline, "the farm came to a stand"
+        if task := queue.claim(D):
+            do(queue, task, D)
+        else:
+            time.sleep(0.005)
+    time.sleep(0.02)
+    assert queue.claim(D) is None
+    assert all(depth == (0, 0) for depth in queue.depths().values())
+    for job in ("one", "two"):
+        assert redis.hget(f"pileus:job:{job}", "out") == "0"
+        seen = queue.job(job)
+        assert seen is not None
+        assert seen.frames_done + seen.frames_failed == seen.frames

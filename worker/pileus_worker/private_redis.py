@@ -1,0 +1,95 @@
+"""A Redis of our own: a child process on a Unix socket, its append-only file in a folder."""
+
+import ctypes
+import shutil
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from redis import Redis
+from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_fixed
+
+from pileus_service.errors import FarmError
+from pileus_service.queue import UNREACHABLE
+
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """Run in a new child: it ends when its parent is killed, leaving nothing behind."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class PrivateRedis:
+    """Starts on entry, answers before entry ends, is stopped in order on exit."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        # Not in the folder itself: a socket's path may have 107 characters at most.
+        self._socket_folder = Path(tempfile.mkdtemp(prefix="pileus-"))
+        self._socket = self._socket_folder / "redis"
+        self.url = f"unix://{self._socket}"
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    def __enter__(self) -> Self:
+        program = shutil.which("redis-server")
+        if program is None:
+            raise FarmError(
+                "redis-server is not installed; on Debian: apt-get install redis-server"
+            )
+        self._folder.mkdir(parents=True, exist_ok=True)
+        options = {
+            "port": "0",
+            "unixsocket": str(self._socket),
+            "unixsocketperm": "700",
+            "dir": str(self._folder.resolve()),
+            "appendonly": "yes",
+            "save": "",
+            "logfile": "redis.log",
+            "maxmemory-policy": "noeviction",
+        }
+        self._process = subprocess.Popen(
+            [program, *(word for key, value in options.items() for word in (f"--{key}", value))],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            # Away from the terminal's Ctrl-C: Redis is the last to go.
+            start_new_session=True,
+            preexec_fn=die_with_parent,
+        )
+        self._answers()
+        return self
+
+    @retry(
+        retry=retry_if_exception_type(UNREACHABLE),
+        stop=stop_after_delay(20),
+        wait=wait_fixed(0.02),
+        reraise=True,
+    )
+    def _answers(self) -> None:
+        if self._process is not None and self._process.poll() is not None:
+            raise FarmError(f"redis-server ended at once; see {self._folder / 'redis.log'}")
+        with Redis.from_url(self.url) as client:
+            client.ping()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(10)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        shutil.rmtree(self._socket_folder, ignore_errors=True)
