@@ -192,6 +192,7 @@ class JobView(Record):
     finished: float | None = None
     seconds_left: float | None = None
     reason: str | None = None
+    active: list[FrameView] = []
 
 
 def new_id() -> str:

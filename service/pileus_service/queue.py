@@ -92,9 +92,6 @@ class Queue:
         """Does what a user asks to a job; returns its state afterwards, None if unknown."""
         return cast(str | None, self._run("control", job, verb, priority))
 
-    def knows(self, job: str) -> bool:
-        return bool(self.redis.exists(f"pileus:job:{job}"))
-
     def job_ids(self) -> list[str]:
         return cast(list[str], self.redis.zrange("pileus:jobs", 0, -1))
 
@@ -126,10 +123,18 @@ class Queue:
             started=int(held["started"]) / 1000 if "started" in held else None,
             finished=int(held["finished"]) / 1000 if "finished" in held else None,
             reason=reason,
+            active=list(active.values()),
         )
 
     def state(self, job: str) -> str | None:
         return cast(str | None, self.redis.hget(f"pileus:job:{job}", "state"))
+
+    def standing(self, job: str) -> tuple[str | None, int]:
+        """A job's state (None if unknown) and priority."""
+        state, priority = cast(
+            list[str | None], self.redis.hmget(f"pileus:job:{job}", "state", "priority")
+        )
+        return state, int(priority or 0)
 
     def failed(self, job: str) -> dict[int, str]:
         """Reason by frame index."""

@@ -1,0 +1,175 @@
+"""The HTTP API: thin routes over the farm. Errors are problem documents, see `problems`."""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from fastapi import APIRouter, Depends, FastAPI, Header, Query, Response
+from fastapi import Path as PathParam
+from fastapi.responses import FileResponse
+from pydantic import BaseModel, Field
+from redis.exceptions import RedisError
+from sse_starlette import EventSourceResponse
+from starlette.concurrency import run_in_threadpool
+
+from pileus_service import __version__, metrics, problems
+from pileus_service.auth import Guard
+from pileus_service.farm import ConflictError, Farm
+from pileus_service.jobs import JOB_ID, TERMINAL, FrameView, JobView, WorkerView
+from pileus_service.messages import Accepted, Change, Submission
+from pileus_service.problems import Problem
+
+log = logging.getLogger(__name__)
+
+MAX_BODY = 1 << 20
+T = TypeVar("T")
+
+Id = Annotated[str, PathParam(pattern=f"^{JOB_ID.pattern}$")]
+FrameNumber = Annotated[int, PathParam(ge=0, le=999_999_999)]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+Offset = Annotated[int, Query(ge=0, le=1_000_000)]
+Key = Annotated[str | None, Header(min_length=1, max_length=200, alias="Idempotency-Key")]
+
+
+class Health(BaseModel):
+    status: Literal["ok"] = "ok"
+    version: str = Field(default=__version__)
+
+
+def create_app(farm: Farm, guard: Guard) -> FastAPI:
+    """The app over a farm; a background task keeps Redis true to the disk."""
+
+    async def keep_true() -> None:
+        while True:
+            try:
+                await run_in_threadpool(farm.reconcile)
+            except (RedisError, OSError) as error:
+                log.warning("cannot reconcile yet: %s", error)
+            await asyncio.sleep(1)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        keeper = asyncio.create_task(keep_true())
+        yield
+        keeper.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await keeper
+
+    app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
+    problems.install(app)
+    app.add_middleware(problems.BodyLimit, limit=MAX_BODY)
+    app.include_router(_jobs(farm), prefix="/v1", dependencies=[Depends(guard)])
+
+    @app.get("/v1/workers", dependencies=[Depends(guard)], tags=["farm"])
+    def workers() -> list[WorkerView]:
+        return farm.queue.workers()
+
+    @app.get("/metrics", dependencies=[Depends(guard)], tags=["farm"])
+    def prometheus() -> Response:
+        return Response(metrics.exposition(farm.queue), media_type="text/plain; version=0.0.4")
+
+    @app.get("/healthz", tags=["farm"])
+    def healthy() -> Health:
+        return Health()
+
+    @app.get("/readyz", tags=["farm"])
+    def ready() -> Health:
+        farm.queue.redis.ping()
+        return Health()
+
+    return app
+
+
+def _jobs(farm: Farm) -> APIRouter:
+    router = APIRouter(prefix="/jobs", tags=["jobs"], responses=problems.RESPONSES)
+
+    @router.post("", status_code=201)
+    def submit(body: Submission, response: Response, idempotency_key: Key = None) -> Accepted:
+        """Takes a shot. The same Idempotency-Key with the same shot is the same job."""
+        try:
+            job, new = farm.submit(body.shot, body.priority, idempotency_key)
+        except ConflictError as error:
+            raise Problem(409, str(error)) from None
+        if not new:
+            response.status_code = 200
+        response.headers["Location"] = f"/v1/jobs/{job.id}"
+        return Accepted(job=job, warnings=body.shot.warnings())
+
+    @router.get("")
+    def jobs(limit: Limit = 100, offset: Offset = 0) -> list[JobView]:
+        """The newest first."""
+        return farm.jobs(limit, offset)
+
+    @router.get("/{job_id}")
+    def job(job_id: Id) -> JobView:
+        return _found(farm.job(job_id), job_id)
+
+    @router.get("/{job_id}/frames")
+    def frames(job_id: Id, limit: Limit = 100, offset: Offset = 0) -> list[FrameView]:
+        return _found(farm.frames(job_id, limit, offset), job_id)
+
+    @router.get("/{job_id}/frames/{frame}/preview.png", response_class=FileResponse)
+    def preview(job_id: Id, frame: FrameNumber) -> FileResponse:
+        _found(farm.done(job_id, frame), f"{job_id}, frame {frame}")
+        return _file(farm.store.frame(job_id, frame).preview, "image/png")
+
+    @router.get("/{job_id}/frames/{frame}/image.exr", response_class=FileResponse)
+    def image(job_id: Id, frame: FrameNumber) -> FileResponse:
+        done = _found(farm.done(job_id, frame), f"{job_id}, frame {frame}")
+        return _file(Path(done.file), "image/x-exr")
+
+    @router.post("/{job_id}/cancel")
+    def cancel(job_id: Id) -> JobView:
+        return _found(farm.control(job_id, "cancel"), job_id)
+
+    @router.post("/{job_id}/pause")
+    def pause(job_id: Id) -> JobView:
+        return _found(farm.control(job_id, "pause"), job_id)
+
+    @router.post("/{job_id}/resume")
+    def resume(job_id: Id) -> JobView:
+        return _found(farm.control(job_id, "resume"), job_id)
+
+    @router.patch("/{job_id}")
+    def change(job_id: Id, body: Change) -> JobView:
+        return _found(farm.control(job_id, "priority", body.priority), job_id)
+
+    @router.delete("/{job_id}", status_code=204)
+    def remove(job_id: Id) -> None:
+        """Cancels the job and forgets it; its images stay."""
+        _found(farm.remove(job_id) or None, job_id)
+
+    @router.get("/{job_id}/events", response_class=EventSourceResponse)
+    async def events(job_id: Id) -> EventSourceResponse:
+        """The job each time it changes, until it ends."""
+        _found(await run_in_threadpool(farm.job, job_id), job_id)
+
+        async def changes() -> AsyncIterator[dict[str, str]]:
+            told = ""
+            while view := await run_in_threadpool(farm.job, job_id):
+                steady = view.model_copy(update={"seconds_left": None}).model_dump_json()
+                if steady != told:
+                    told = steady
+                    yield {"event": "job", "data": view.model_dump_json()}
+                if view.state in TERMINAL:
+                    return
+                await asyncio.sleep(0.5)
+
+        return EventSourceResponse(changes())
+
+    return router
+
+
+def _found(thing: T | None, name: str) -> T:
+    if thing is None:
+        raise Problem(404, f"No {name} here")
+    return thing
+
+
+def _file(path: Path, media_type: str) -> FileResponse:
+    if not path.is_file():
+        raise Problem(404, f"{path.name} is gone from the disk")
+    return FileResponse(path, media_type=media_type, filename=path.name)

@@ -1,0 +1,269 @@
+"""The `pileus` program: the client's commands, and the worker's where they are installed."""
+
+import json
+import os
+import signal
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from pileus_service import __version__
+from pileus_service.client import Client
+from pileus_service.errors import FarmError, InputError
+from pileus_service.jobs import FrameView, JobState, JobView, Record
+from pileus_service.progress import Display, Row, duration
+from pileus_service.shotfile import load_shot
+
+Server = Annotated[
+    str, typer.Option(envvar="PILEUS_SERVER", help="The service's address.", metavar="URL")
+]
+Token = Annotated[
+    str | None, typer.Option(envvar="PILEUS_TOKEN", help="The service's token.", metavar="TOKEN")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")]
+JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.")]
+LOCAL = "http://127.0.0.1:8765"
+
+
+class Commands(TyperGroup):
+    """The commands of this package and those that other packages register."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        others = {point.name for point in entry_points(group="pileus.commands")}
+        return [*super().list_commands(ctx), *sorted(others)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        for point in entry_points(group="pileus.commands", name=cmd_name):
+            try:
+                return get_command(point.load())
+            except ImportError as error:
+                return get_command(_absent(cmd_name, error))
+        return super().get_command(ctx, cmd_name)
+
+
+def _absent(name: str, error: ImportError) -> typer.Typer:
+    """Stands for a command whose package is not here, and says what to install."""
+    stub = typer.Typer()
+
+    @stub.command(
+        name,
+        help="Needs the renderer, which is not installed.",
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    )
+    def explain() -> None:
+        raise FarmError(
+            f"pileus {name} needs the renderer: pip install ./core 'pileus[worker]' ({error})"
+        )
+
+    return stub
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="Renders animated volumes with art-directable multiple scattering, here or on a farm.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback(invoke_without_command=True)
+def program(
+    version: Annotated[bool, typer.Option("--version", help="Says the version and ends.")] = False,
+) -> None:
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def submit(
+    shot: Annotated[Path, typer.Argument(help="The shot, TOML or JSON.")],
+    server: Server = LOCAL,
+    token: Token = None,
+    frames: Annotated[str | None, typer.Option(help='Only these, as "1-24x2".')] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Overrides a value.")
+    ] = None,
+    priority: Annotated[int, typer.Option(min=0, max=9, help="The higher the sooner.")] = 5,
+    key: Annotated[str | None, typer.Option(help="Idempotency key: submit once.")] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Waits until it ends.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Sends a shot to the farm."""
+    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
+    with Client(server, token) as client:
+        accepted = client.submit(load_shot(shot, settings), priority, key)
+        for warning in accepted.warnings:
+            print(f"{shot}: warning: {warning}", file=sys.stderr)
+        job = accepted.job
+        if wait:
+            job = _wait(client, job)
+        elif not as_json:
+            print(job.id)
+    if as_json:
+        _print_json(job)
+    if job.state in (JobState.FAILED, JobState.CANCELLED):
+        raise FarmError(f"{job.id}: {job.state}{f': {job.reason}' if job.reason else ''}")
+
+
+@app.command("list")
+def list_jobs(server: Server = LOCAL, token: Token = None, as_json: AsJson = False) -> None:
+    """Lists the jobs, the newest first."""
+    with Client(server, token) as client:
+        jobs = client.jobs()
+    if as_json:
+        _print_json(jobs)
+        return
+    table = _table("job", "name", "state", "priority", "frames", "done", "left")
+    for job in jobs:
+        frames = f"{job.frames_done} of {job.frames}"
+        left = duration(job.seconds_left)
+        table.add_row(
+            job.id, job.name, job.state, str(job.priority), frames, f"{job.progress:.0%}", left
+        )
+    Console().print(table)
+
+
+@app.command()
+def status(
+    job: JobArgument, server: Server = LOCAL, token: Token = None, as_json: AsJson = False
+) -> None:
+    """Shows a job and its frames."""
+    with Client(server, token) as client:
+        view, frames = client.job(job), list(client.frames(job))
+    if as_json:
+        told = view.model_dump(mode="json")
+        told["frames_list"] = [frame.model_dump(mode="json") for frame in frames]
+        print(json.dumps(told))
+        return
+    print(f"{view.id} {view.name}: {view.state}, {_describe(view)}")
+    table = _table("frame", "state", "done", "seconds", "")
+    for frame in frames:
+        seconds = f"{frame.seconds:.1f}" if frame.seconds is not None else ""
+        told_by = frame.file if frame.state == "done" else frame.reason
+        table.add_row(
+            str(frame.frame), frame.state, f"{frame.progress:.0%}", seconds, told_by or ""
+        )
+    Console().print(table)
+
+
+def _verb(verb: Literal["cancel", "pause", "resume"], text: str) -> None:
+    @app.command(verb, help=text)
+    def act(
+        job: JobArgument, server: Server = LOCAL, token: Token = None, as_json: AsJson = False
+    ) -> None:
+        with Client(server, token) as client:
+            view = client.control(job, verb)
+        if as_json:
+            _print_json(view)
+        else:
+            print(f"{view.id}: {view.state}")
+
+
+_verb("cancel", "Stops a job for good.")
+_verb("pause", "Holds a job's tasks back; those that run finish.")
+_verb("resume", "Lets a paused job go on.")
+
+
+@app.command()
+def workers(server: Server = LOCAL, token: Token = None, as_json: AsJson = False) -> None:
+    """Lists the workers and what they do."""
+    with Client(server, token) as client:
+        seen = client.workers()
+    if as_json:
+        _print_json(seen)
+        return
+    table = _table("worker", "alive", "threads", "task")
+    for worker in seen:
+        task = str(worker.task) if worker.task else ""
+        table.add_row(worker.name, "yes" if worker.alive else "no", str(worker.threads), task)
+    Console().print(table)
+
+
+@app.command()
+def service(
+    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
+        "pileus-data"
+    ),
+    redis: Annotated[str, typer.Option(envvar="PILEUS_REDIS", help="Redis's address.")] = (
+        "redis://127.0.0.1:6379/0"
+    ),
+    root: Annotated[
+        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
+    ] = None,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT")] = "127.0.0.1:8765",
+) -> None:
+    """Runs the HTTP service alone; workers join it through Redis and the data folder."""
+    from pileus_service.server import serve  # a client need not load it
+
+    serve(data, redis, root or [Path.cwd()], listen)
+
+
+def _wait(client: Client, job: JobView) -> JobView:
+    with Display() as display:
+        for view in client.watch(job.id):
+            job = view
+            whole = Row(job.name, job.progress, _describe(job))
+            display.show(whole, *map(_frame_row, job.active))
+        display.note(f"{job.name}: {job.state}, {_describe(job)}")
+    return job
+
+
+def _frame_row(frame: FrameView) -> Row:
+    tasks = f"{frame.tasks_done} of {frame.tasks} tasks" if frame.tasks else ""
+    return Row(f"  frame {frame.frame}", frame.progress, f"{frame.state} {tasks}")
+
+
+def _describe(job: JobView) -> str:
+    text = f"{job.frames_done} of {job.frames} frames"
+    if job.frames_failed:
+        text += f", {job.frames_failed} failed"
+    text += f", {job.samples / 1e6:.1f} M samples"
+    if job.seconds_left is not None:
+        text += f", {duration(job.seconds_left)} left"
+    elif job.finished and job.started:
+        text += f", took {duration(job.finished - job.started)}"
+    return text
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column, no_wrap=column == "job")
+    return table
+
+
+def _print_json(thing: Record | list[Any]) -> None:
+    if isinstance(thing, list):
+        print(json.dumps([each.model_dump(mode="json") for each in thing]))
+    else:
+        print(thing.model_dump_json())
+
+
+def main() -> None:
+    """Runs a command; a user's error is one line, never a stack trace."""
+    try:
+        app()
+    except InputError as error:
+        _end(f"pileus: {error}", 2)
+    except FarmError as error:
+        _end(f"pileus: {error}", 1)
+    except KeyboardInterrupt:
+        _end("pileus: stopped", 128 + signal.SIGINT)
+    except BrokenPipeError:
+        # The reader has gone, as in `pileus list | head`: nothing is left to say.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def _end(line: str, code: int) -> None:
+    print(line, file=sys.stderr)
+    sys.exit(code)

@@ -1,0 +1,106 @@
+"""The API's client: what the commands and scripts use."""
+
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+from pydantic import BaseModel, TypeAdapter
+from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_random_exponential
+
+from pileus_service.errors import FarmError, InputError
+from pileus_service.jobs import TERMINAL, FrameView, JobView, WorkerView
+from pileus_service.messages import Accepted
+from pileus_service.shot import Shot
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Client:
+    """One service; refused requests raise InputError, a silent service FarmError."""
+
+    def __init__(self, server: str, token: str | None = None) -> None:
+        self._server = server
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._http = httpx.Client(base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=30)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._http.close()
+
+    def submit(self, shot: Shot, priority: int = 5, key: str | None = None) -> Accepted:
+        body = {"shot": shot.model_dump(mode="json"), "priority": priority}
+        headers = {"Idempotency-Key": key} if key else {}
+        answer = self._ask("POST", "/jobs", json=body, headers=headers)
+        return Accepted.model_validate_json(answer.content)
+
+    def jobs(self, limit: int = 100) -> list[JobView]:
+        answer = self._ask("GET", "/jobs", params={"limit": limit})
+        return TypeAdapter(list[JobView]).validate_json(answer.content)
+
+    def job(self, job: str) -> JobView:
+        return JobView.model_validate_json(self._ask("GET", f"/jobs/{job}").content)
+
+    def frames(self, job: str) -> Iterator[FrameView]:
+        offset = 0
+        while True:
+            answer = self._ask(
+                "GET", f"/jobs/{job}/frames", params={"limit": 1000, "offset": offset}
+            )
+            page = TypeAdapter(list[FrameView]).validate_json(answer.content)
+            yield from page
+            if len(page) < 1000:
+                return
+            offset += len(page)
+
+    def control(self, job: str, verb: str) -> JobView:
+        return JobView.model_validate_json(self._ask("POST", f"/jobs/{job}/{verb}").content)
+
+    def workers(self) -> list[WorkerView]:
+        return TypeAdapter(list[WorkerView]).validate_json(self._ask("GET", "/workers").content)
+
+    def watch(self, job: str) -> Iterator[JobView]:
+        """The job twice a second until it ends; rides out a restart of the service."""
+
+        @retry(
+            retry=retry_if_exception_type(FarmError),
+            wait=wait_random_exponential(multiplier=0.2, max=5),
+            stop=stop_after_delay(120),
+            reraise=True,
+        )
+        def look() -> JobView:
+            return self.job(job)
+
+        while True:
+            view = look()
+            yield view
+            if view.state in TERMINAL:
+                return
+            time.sleep(0.5)
+
+    def _ask(self, verb: str, path: str, **more: Any) -> httpx.Response:
+        try:
+            answer = self._http.request(verb, path, **more)
+        except httpx.InvalidURL as error:
+            raise InputError(f"--server {self._server}: {error}") from None
+        except httpx.TransportError as error:
+            raise FarmError(
+                f"{self._server}: no service answers ({error}); start one with `pileus up`"
+            ) from None
+        if answer.is_success:
+            return answer
+        try:
+            detail = answer.json()["detail"]
+        except (ValueError, KeyError, TypeError):
+            detail = f"answered {answer.status_code}; is this a Pileus service?"
+        if answer.is_client_error:
+            raise InputError(str(detail))
+        raise FarmError(f"{self._server}: {detail}")

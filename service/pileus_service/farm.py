@@ -1,0 +1,195 @@
+"""The farm as the service sees it: the store, which is the truth, and the queue kept true to it."""
+
+import threading
+import time
+
+from pileus_service.errors import InputError
+from pileus_service.jobs import (
+    TERMINAL,
+    Done,
+    FrameView,
+    Job,
+    JobState,
+    JobView,
+    Priority,
+    Wish,
+    id_for_key,
+    new_id,
+)
+from pileus_service.queue import Queue, Verb
+from pileus_service.roots import Roots
+from pileus_service.shot import Shot
+from pileus_service.shotfile import check_files
+from pileus_service.store import Store
+
+_WISHED: dict[str, Verb] = {"paused": "pause", "running": "resume", "cancelled": "cancel"}
+
+
+class ConflictError(InputError):
+    """The same idempotency key was used for something else."""
+
+
+class Farm:
+    """Submits, steers and shows jobs. Disk first, Redis second: `reconcile` mends the rest."""
+
+    def __init__(self, store: Store, queue: Queue, roots: Roots) -> None:
+        self.store = store
+        self.queue = queue
+        self.roots = roots
+        self._lock = threading.RLock()
+        self._wishes: dict[str, Wish] = {}
+
+    def submit(self, shot: Shot, priority: Priority, key: str | None) -> tuple[JobView, bool]:
+        """Takes a shot in; with a key, once. Returns the job and whether it is new."""
+        shot = shot.anchored(self.roots.first)
+        numbers = shot.frame_numbers
+        self.roots.check(shot, numbers)
+        check_files(shot, shot.name, numbers)
+        job = Job(id=id_for_key(key) if key else new_id(), created=time.time(), shot=shot)
+        wish = Wish(priority=priority)
+        new = self.store.create(job, wish)
+        if not new:
+            held = self.store.job(job.id)
+            if held is not None and held.shot != shot:
+                raise ConflictError("Idempotency-Key: was used for another shot; take a new key")
+        view = self.job(job.id)
+        assert view is not None
+        return view, new
+
+    def control(self, job_id: str, verb: Verb, priority: int = 0) -> JobView | None:
+        """Pauses, resumes, cancels a job or changes its priority."""
+        with self._lock:
+            if self.job(job_id) is None:
+                return None
+            wish = self.store.wished(job_id)
+            if verb == "priority":
+                wish = wish.model_copy(update={"priority": priority})
+            elif wish.state not in TERMINAL:
+                state = {"pause": "paused", "resume": "running", "cancel": "cancelled"}[verb]
+                wish = wish.model_copy(update={"state": state})
+            self._keep(job_id, wish)
+            self.queue.control(job_id, verb, priority)
+            return self.job(job_id)
+
+    def remove(self, job_id: str) -> bool:
+        with self._lock:
+            if self.store.job(job_id) is None:
+                return False
+            self._wishes.pop(job_id, None)
+            # The disk first, or a reconciliation would bring it back.
+            self.store.remove(job_id)
+            self.queue.control(job_id, "cancel")
+            self.queue.control(job_id, "remove")
+            return True
+
+    def job(self, job_id: str) -> JobView | None:
+        """A job; one that Redis has lost is put back first."""
+        view = self.queue.job(job_id)
+        if view is None:
+            if not self._restore(job_id):
+                return None
+            view = self.queue.job(job_id)
+        return self._timed(view) if view else None
+
+    def jobs(self, limit: int, offset: int) -> list[JobView]:
+        """Newest first."""
+        workers = self.queue.workers()
+        ids = self.queue.job_ids()[::-1][offset : offset + limit]
+        views = [self.queue.job(job_id, workers) for job_id in ids]
+        return [self._timed(view) for view in views if view]
+
+    def frames(self, job_id: str, limit: int, offset: int) -> list[FrameView] | None:
+        job, view = self.store.job(job_id), self.job(job_id)
+        if job is None or view is None:
+            return None
+        failed = self.queue.failed(job_id)
+        active = self.queue.active(job_id, self.queue.workers())
+        frames = []
+        for index, number in list(enumerate(job.shot.frame_numbers))[offset : offset + limit]:
+            if index in active:
+                frames.append(active[index].model_copy(update={"frame": number}))
+            elif index in failed:
+                frames.append(FrameView(frame=number, state="failed", reason=failed[index]))
+            elif done := self.store.frame(job_id, number).done():
+                frames.append(
+                    FrameView(
+                        frame=number,
+                        state="done",
+                        progress=1.0,
+                        file=done.file,
+                        seconds=done.seconds,
+                        reason=done.reason,
+                    )
+                )
+            else:
+                cancelled = view.state is JobState.CANCELLED
+                frames.append(
+                    FrameView(frame=number, state="cancelled" if cancelled else "waiting")
+                )
+        return frames
+
+    def done(self, job_id: str, frame: int) -> Done | None:
+        return self.store.frame(job_id, frame).done() if self.store.job(job_id) else None
+
+    def reconcile(self) -> None:
+        """Makes Redis agree with the disk, and notes on disk how jobs ended. Called each second."""
+        known = set(self.queue.job_ids())
+        for job_id in self.store.job_ids():
+            with self._lock:
+                wish = self._wishes.get(job_id) or self.store.wished(job_id)
+                self._wishes[job_id] = wish
+                if wish.state in TERMINAL and job_id in known:
+                    continue
+                state, priority = self.queue.standing(job_id)
+                if state is None:
+                    self._restore(job_id)
+                elif state in TERMINAL:
+                    if wish.state != state:
+                        self._note_end(job_id, state)
+                elif (state, priority) != (wish.state, wish.priority):
+                    # Another service may have written since; what is on disk now holds.
+                    self._wishes[job_id] = wish = self.store.wished(job_id)
+                    if wish.state in _WISHED and wish.state != state:
+                        self.queue.control(job_id, _WISHED[wish.state])
+                    if wish.priority != priority:
+                        self.queue.control(job_id, "priority", wish.priority)
+        self.queue.forget_dead()
+
+    def _restore(self, job_id: str) -> bool:
+        """Puts a job of the disk into Redis; what it has finished stays finished."""
+        job = self.store.job(job_id)
+        if job is None:
+            return False
+        done = self.store.done_frames(job)
+        wish = self.store.wished(job_id)
+        frames = len(job.shot.frame_numbers)
+        self.queue.submit(job_id, job.shot.name, job.created, frames, wish, done)
+        return True
+
+    def _note_end(self, job_id: str, state: str) -> None:
+        view = self.queue.job(job_id)
+        if view is not None:
+            wish = Wish.model_validate(
+                {
+                    "state": state,
+                    "priority": view.priority,
+                    "finished": view.finished,
+                    "failed": self.queue.failed(job_id),
+                }
+            )
+            self._keep(job_id, wish)
+
+    def _keep(self, job_id: str, wish: Wish) -> None:
+        self.store.wish(job_id, wish)
+        self._wishes[job_id] = wish
+
+    def _timed(self, view: JobView) -> JobView:
+        """Adds frame numbers for indices, and the time left, from the pace so far."""
+        job = self.store.job(view.id)
+        numbers = job.shot.frame_numbers if job and view.active else []
+        active = [frame.model_copy(update={"frame": numbers[frame.frame]}) for frame in view.active]
+        left = None
+        if view.state is JobState.RUNNING and view.started and view.progress > 0:
+            spent = max(0.0, time.time() - view.started)
+            left = spent * (1 - view.progress) / view.progress
+        return view.model_copy(update={"active": active, "seconds_left": left})

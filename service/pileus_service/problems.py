@@ -1,0 +1,109 @@
+"""Every error of the API as an RFC 9457 problem document."""
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from redis.exceptions import RedisError
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from pileus_service.errors import InputError
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class FieldError(BaseModel):
+    pointer: str
+    detail: str
+
+
+class ProblemDocument(BaseModel):
+    """What a client gets in place of an answer."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    errors: list[FieldError] = []
+
+
+class Problem(HTTPException):
+    """Raised by routes; status and the one line that tells the trouble and the mend."""
+
+
+def _answer(
+    status: int, detail: str, errors: list[FieldError], headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    document = ProblemDocument(
+        title=HTTPStatus(status).phrase, status=status, detail=detail, errors=errors
+    )
+    return JSONResponse(
+        document.model_dump(), status, headers=dict(headers or {}), media_type=MEDIA_TYPE
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Makes every error of the app a problem document."""
+
+    @app.exception_handler(HTTPException)
+    def http(_: Request, error: HTTPException) -> JSONResponse:
+        return _answer(error.status_code, str(error.detail), [], error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    def invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        errors = [
+            FieldError(
+                pointer="/" + "/".join(str(part) for part in each["loc"]),
+                detail=each["msg"].removeprefix("Value error, "),
+            )
+            for each in error.errors()[:20]
+        ]
+        first = errors[0]
+        return _answer(422, f"{first.pointer[1:].replace('/', '.')}: {first.detail}", errors)
+
+    @app.exception_handler(InputError)
+    def refused(_: Request, error: InputError) -> JSONResponse:
+        return _answer(422, str(error), [])
+
+    @app.exception_handler(RedisError)
+    def no_redis(_: Request, error: RedisError) -> JSONResponse:
+        return _answer(503, "Redis does not answer; try again", [], {"Retry-After": "2"})
+
+    @app.exception_handler(Exception)
+    def unforeseen(_: Request, error: Exception) -> JSONResponse:
+        return _answer(500, "An unforeseen error; the service's log has it", [])
+
+
+class BodyLimit:
+    """ASGI middleware that refuses bodies over a size, announced or not."""
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self._app = app
+        self._limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        got = 0
+
+        async def bounded() -> Message:
+            nonlocal got
+            message = await receive()
+            got += len(message.get("body", b""))
+            if got > self._limit:
+                raise Problem(413, f"The body has over {self._limit} bytes")
+            return message
+
+        await self._app(scope, bounded, send)
+
+
+RESPONSES: dict[int | str, dict[str, Any]] = {
+    status: {
+        "description": HTTPStatus(status).phrase,
+        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
+    }
+    for status in (400, 401, 403, 404, 409, 413, 422, 503)
+}

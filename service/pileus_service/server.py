@@ -1,0 +1,43 @@
+"""Runs the service: uvicorn over the app, on a private or a shared Redis."""
+
+import sys
+from pathlib import Path
+
+import uvicorn
+
+from pileus_service.app import create_app
+from pileus_service.auth import guard_for
+from pileus_service.errors import InputError
+from pileus_service.farm import Farm
+from pileus_service.queue import Queue, connect
+from pileus_service.roots import Roots
+from pileus_service.store import Store
+
+
+def split_address(listen: str) -> tuple[str, int]:
+    host, colon, port = listen.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"--listen {listen}: write HOST:PORT, as 127.0.0.1:8765")
+    return host.strip("[]"), int(port)
+
+
+def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> uvicorn.Server:
+    """A server ready to run; says the token, once, where it had to make one."""
+    host, port = split_address(listen)
+    try:
+        store = Store(data.resolve())
+        guard, token = guard_for(host, data)
+    except OSError as error:
+        raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
+    if token:
+        print(f"The token of this farm, shown this once: {token}", file=sys.stderr)
+    try:
+        queue = Queue(connect(redis_url))
+    except ValueError as error:
+        raise InputError(f"--redis {redis_url}: {error}") from None
+    app = create_app(Farm(store, queue, Roots(roots)), guard)
+    return uvicorn.Server(uvicorn.Config(app, host=host, port=port, log_level="warning"))
+
+
+def serve(data: Path, redis_url: str, roots: list[Path], listen: str) -> None:
+    make_server(data, redis_url, roots, listen).run()
