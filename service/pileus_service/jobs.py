@@ -88,7 +88,7 @@ class Plan(Record):
     cache: Cache
     parts: list[Part]
     empty: list[Bucket]
-    seconds: float
+    begun: float
 
 
 class Done(Record):

@@ -1,5 +1,7 @@
 """Runs the service: uvicorn over the app, on a private or a shared Redis."""
 
+import contextlib
+import socket
 import sys
 from pathlib import Path
 
@@ -21,9 +23,21 @@ def split_address(listen: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
+def bind(listen: str) -> socket.socket:
+    """A bound socket; port 0 takes any that is free."""
+    host, port = split_address(listen)
+    try:
+        return socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"--listen {listen}: {reason}; choose another address") from None
+
+
 def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> uvicorn.Server:
     """A server ready to run; says the token, once, where it had to make one."""
-    host, port = split_address(listen)
+    host, _ = split_address(listen)
     try:
         store = Store(data.resolve())
         guard, token = guard_for(host, data)
@@ -36,8 +50,11 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
     except ValueError as error:
         raise InputError(f"--redis {redis_url}: {error}") from None
     app = create_app(Farm(store, queue, Roots(roots)), guard)
-    return uvicorn.Server(uvicorn.Config(app, host=host, port=port, log_level="warning"))
+    # Watchers hold their connections open: they are not waited for at the end.
+    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
+    return uvicorn.Server(config)
 
 
 def serve(data: Path, redis_url: str, roots: list[Path], listen: str) -> None:
-    make_server(data, redis_url, roots, listen).run()
+    with contextlib.closing(bind(listen)) as listener:
+        make_server(data, redis_url, roots, listen).run([listener])

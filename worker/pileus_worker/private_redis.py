@@ -1,8 +1,6 @@
 """A Redis of our own: a child process on a Unix socket, its append-only file in a folder."""
 
-import ctypes
 import shutil
-import signal
 import subprocess
 import tempfile
 from pathlib import Path
@@ -14,13 +12,7 @@ from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_fixe
 
 from pileus_service.errors import FarmError
 from pileus_service.queue import UNREACHABLE
-
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with_parent() -> None:
-    """Run in a new child: it ends when its parent is killed, leaving nothing behind."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+from pileus_worker.lifeline import die_with_parent
 
 
 class PrivateRedis:

@@ -1,0 +1,77 @@
+"""`pileus make`: procedural animated caches."""
+
+import multiprocessing
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pileus_core as core
+import typer
+
+from pileus_service.errors import InputError
+from pileus_service.frames import expand, has_pattern, parse_frames
+from pileus_service.progress import Display, Row, duration
+from pileus_worker import machine
+from pileus_worker.errors import plain_errors
+
+app = typer.Typer(help="Makes procedural animated VDB caches, with velocity.", no_args_is_help=True)
+
+Subject = Literal["cloud", "whitewater"]
+Frames = Annotated[str, typer.Option(help='The frames, as "1-24".')]
+Resolution = Annotated[int, typer.Option(min=8, max=4096, help="Voxels a world unit.")]
+Seed = Annotated[int, typer.Option(min=0, help="Another seed, another shape.")]
+Out = Annotated[str, typer.Argument(metavar="OUT", help="The files, as caches/cloud.####.vdb.")]
+
+
+@app.command()
+def cloud(out: Out, frames: Frames = "1-24", resolution: Resolution = 256, seed: Seed = 0) -> None:
+    """A fractal cumulus that drifts and billows."""
+    make("cloud", out, frames, resolution, seed)
+
+
+@app.command()
+def whitewater(
+    out: Out, frames: Frames = "1-24", resolution: Resolution = 256, seed: Seed = 0
+) -> None:
+    """A breaking splash with spray."""
+    make("whitewater", out, frames, resolution, seed)
+
+
+def make(subject: Subject, out: str, frames: str, resolution: int, seed: int = 0) -> None:
+    """Makes the frames in parallel processes."""
+    try:
+        numbers = parse_frames(frames)
+    except ValueError as error:
+        raise InputError(f"--frames {frames}: {error}") from None
+    if len(numbers) > 1 and not has_pattern(out):
+        raise InputError(f"{out}: every frame would write this one file; put #### for the number")
+    begun = time.monotonic()
+    voxels = 0
+    with (
+        plain_errors(f"make {subject}"),
+        Display() as display,
+        ProcessPoolExecutor(
+            min(machine.cores(), len(numbers)), multiprocessing.get_context("spawn")
+        ) as pool,
+    ):
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        jobs = [
+            pool.submit(_frame, subject, expand(out, number), index, len(numbers), resolution, seed)
+            for index, number in enumerate(numbers, 1)
+        ]
+        for done, job in enumerate(as_completed(jobs), 1):
+            voxels += job.result()
+            detail = f"{done} of {len(jobs)} frames"
+            display.show(Row(f"making {subject}", done / len(jobs), detail))
+    print(
+        f"{out}: {len(numbers)} frames, {voxels / len(numbers) / 1e6:.2f} M active voxels a frame, "
+        f"{duration(time.monotonic() - begun)}",
+        file=sys.stderr,
+    )
+
+
+def _frame(subject: Subject, path: str, index: int, count: int, resolution: int, seed: int) -> int:
+    write = core.make_cloud if subject == "cloud" else core.make_whitewater
+    return int(write(path, frame=index, frames=count, resolution=resolution, seed=seed))

@@ -1,0 +1,134 @@
+"""`pileus render`: a shot, here and now, in this process."""
+
+import json
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Annotated, Any
+
+import pileus_core as core
+import typer
+
+from pileus_service.progress import Display, Row, duration
+from pileus_service.shot import Shot
+from pileus_service.shotfile import check_files, load_shot
+from pileus_worker import machine, scene
+from pileus_worker.caches import Caches
+from pileus_worker.errors import plain_errors
+
+app = typer.Typer()
+
+
+@app.command("render")
+def render(
+    shot_file: Annotated[Path, typer.Argument(metavar="SHOT", help="The shot, TOML or JSON.")],
+    frames: Annotated[str | None, typer.Option(help='Only these, as "1-24x2".')] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Overrides a value.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Writes the images here.")] = None,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="0 takes all cores.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")] = False,
+) -> None:
+    """Renders a shot here and now: no farm needed."""
+    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
+    shot = load_shot(shot_file, settings)
+    if out is not None:
+        output = str(out.resolve() / Path(shot.image.output).name)
+        shot = shot.model_copy(update={"image": shot.image.model_copy(update={"output": output})})
+    check_files(shot, str(shot_file), shot.frame_numbers)
+    for warning in shot.warnings():
+        print(f"{shot_file}: warning: {warning}", file=sys.stderr)
+    with plain_errors(str(shot_file)), Display() as display:
+        reports = Renderer(shot, threads, display).all_frames()
+    if as_json:
+        print(json.dumps({"frames": reports}))
+
+
+class Renderer:
+    """The frames of a shot one by one; the next cache is read while one renders."""
+
+    def __init__(self, shot: Shot, threads: int, display: Display) -> None:
+        self._shot = shot
+        self._threads = threads or machine.cores()
+        self._display = display
+        self._frames = shot.frame_numbers
+        self._transport = scene.make_transport(shot)
+        self._caches = Caches(machine.cache_bytes())
+        self._begun = time.monotonic()
+
+    def all_frames(self) -> list[dict[str, Any]]:
+        return [self._frame(index, frame) for index, frame in enumerate(self._frames)]
+
+    def _frame(self, index: int, number: int) -> dict[str, Any]:
+        shot, image = self._shot, self._shot.image
+        begun = time.monotonic()
+        grid = shot.volumes[0].density
+        cache = scene.cache_of(shot, number)
+        volume = self._caches.get(cache, grid)
+        for warning in volume.warnings:
+            self._display.note(f"frame {number}: {warning}")
+        if index + 1 < len(self._frames):
+            self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
+        view = scene.make_scene(shot, number, volume)
+        rendering = time.monotonic()
+        partial = self._samples(view, index, number)
+        render_seconds = time.monotonic() - rendering
+        whole = (0, 0, image.width, image.height)
+        frame = core.Frame(image.width, image.height, [(whole, shot.sampling.samples)])
+        frame.add(partial)
+        output = shot.output(number)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        header = scene.header(shot, number, self._transport, render_seconds)
+        frame.write(str(output), half=image.pixel_type == "half", header=header)
+        seconds = time.monotonic() - begun
+        self._display.note(f"frame {number}: {output}, {duration(seconds)}")
+        return {
+            "frame": number,
+            "file": str(output),
+            "seconds": seconds,
+            "load_seconds": volume.load_seconds,
+            "render_seconds": render_seconds,
+            "samples": shot.sampling.samples,
+            "method": shot.transport.method,
+            "max_bounces": self._transport.max_bounces,
+            "reason": scene.reason(shot),
+        }
+
+    def _samples(self, view: core.Scene, index: int, number: int) -> core.Partial:
+        """All samples of a frame, with progress; a Ctrl-C stops the renderer's threads too."""
+        shot = self._shot
+        control = core.Control()
+        with ThreadPoolExecutor(1) as executor:
+            future = executor.submit(
+                core.render,
+                view,
+                self._transport,
+                bucket=(0, 0, shot.image.width, shot.image.height),
+                samples=(0, shot.sampling.samples),
+                seed=shot.sampling.seed,
+                frame=number,
+                orders=shot.image.orders,
+                threads=self._threads,
+                control=control,
+            )
+            try:
+                while not wait([future], 0.1).done:
+                    self._show(index, number, control.samples_done)
+            except BaseException:
+                control.cancel()
+                raise
+            return future.result()
+
+    def _show(self, index: int, number: int, samples: int) -> None:
+        image = self._shot.image
+        total = image.width * image.height * self._shot.sampling.samples
+        here = min(1.0, samples / total)
+        all_done = (index + here) / len(self._frames)
+        spent = time.monotonic() - self._begun
+        left = duration(spent * (1 - all_done) / all_done) if all_done > 0 else "-"
+        self._display.show(
+            Row(self._shot.name, all_done, f"{index} of {len(self._frames)} frames, {left} left"),
+            Row(f"  frame {number}", here, f"{samples / 1e6:.1f} of {total / 1e6:.1f} M samples"),
+        )

@@ -1,0 +1,37 @@
+"""`pileus up`: the embedded farm, until Ctrl-C."""
+
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pileus_worker.embedded import embedded_farm
+
+app = typer.Typer()
+
+
+@app.command("up")
+def up(
+    workers: Annotated[int, typer.Option(min=1, max=256, help="How many worker processes.")] = 1,
+    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
+        "pileus-data"
+    ),
+    root: Annotated[
+        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
+    ] = None,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT")] = "127.0.0.1:8765",
+) -> None:
+    """Runs a whole farm on this machine: Redis, service and workers. Ctrl-C ends all of it."""
+    stop = threading.Event()
+    # Before anything starts, so that no signal finds half a farm.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    with embedded_farm(data, root or [Path.cwd()], workers, listen) as farm:
+        print(
+            f"The farm is up: {farm.url} (API at {farm.url}/docs), {workers} worker(s)", flush=True
+        )
+        stop.wait()
+        print("Ending...", file=sys.stderr)

@@ -1,0 +1,49 @@
+"""`pileus worker`: one worker, until it is told to stop."""
+
+import logging
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pileus_service.errors import InputError
+from pileus_service.queue import Queue, connect
+from pileus_service.roots import Roots
+from pileus_service.store import Store
+from pileus_worker import machine
+from pileus_worker.supervisor import Limits, Supervisor
+
+app = typer.Typer()
+
+
+@app.command("worker")
+def worker(
+    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
+        "pileus-data"
+    ),
+    redis: Annotated[str, typer.Option(envvar="PILEUS_REDIS", help="Redis's address.")] = (
+        "redis://127.0.0.1:6379/0"
+    ),
+    root: Annotated[
+        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
+    ] = None,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="0 takes all cores.")] = 0,
+    memory: Annotated[
+        float, typer.Option(min=0, help="GiB that rendering may take; 0: most of the machine.")
+    ] = 0.0,
+) -> None:
+    """Runs one worker: takes tasks from Redis until it gets SIGTERM or Ctrl-C."""
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    allowed = int(memory * (1 << 30)) or machine.memory_bytes()
+    limits = Limits(threads or machine.cores(), machine.cache_bytes(allowed), allowed)
+    try:
+        queue = Queue(connect(redis))
+    except ValueError as error:
+        raise InputError(f"--redis {redis}: {error}") from None
+    roots = Roots(root or [Path.cwd()])
+    Supervisor(queue, Store(data.resolve()), tuple(roots.folders), limits).run(stop)

@@ -1,0 +1,131 @@
+"""The embedded farm: a private Redis, the service and N workers, begun and ended together."""
+
+import contextlib
+import fcntl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from pileus_service.errors import FarmError, InputError
+from pileus_service.server import bind, make_server
+from pileus_worker import machine
+from pileus_worker.lifeline import die_with_parent
+from pileus_worker.private_redis import PrivateRedis
+
+
+@dataclass
+class Workers:
+    """The worker processes; one that dies is replaced."""
+
+    command: list[str]
+    count: int
+    log: IO[bytes]
+    _processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    _ending: threading.Event = field(default_factory=threading.Event)
+
+    def begin(self) -> None:
+        self._processes = [self._start() for _ in range(self.count)]
+
+    def pids(self) -> list[int]:
+        return [process.pid for process in self._processes]
+
+    def keep_up(self) -> None:
+        """Replaces dead workers until the end, no faster than one a second."""
+        while not self._ending.wait(1.0):
+            self._processes = [
+                process if process.poll() is None else self._start() for process in self._processes
+            ]
+
+    def end(self) -> None:
+        self._ending.set()
+        for process in self._processes:
+            process.terminate()
+        end = time.monotonic() + 10
+        for process in self._processes:
+            try:
+                process.wait(max(0.1, end - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            self.command,
+            stdin=subprocess.DEVNULL,
+            stdout=self.log,
+            stderr=self.log,
+            # Away from the terminal's Ctrl-C: they are told in order.
+            start_new_session=True,
+            preexec_fn=die_with_parent,
+        )
+
+
+@dataclass(frozen=True)
+class EmbeddedFarm:
+    """A farm that runs."""
+
+    url: str
+    redis_url: str
+    workers: Workers
+
+
+@contextlib.contextmanager
+def embedded_farm(data: Path, roots: list[Path], count: int, listen: str) -> Iterator[EmbeddedFarm]:
+    """Runs a farm while the block runs; whatever ends the block ends all of it, in order."""
+    data = data.resolve()
+    data.mkdir(parents=True, exist_ok=True)
+    with (
+        _alone_in(data),
+        PrivateRedis(data / "redis") as redis,
+        contextlib.closing(bind(listen)) as listener,
+        (data / "workers.log").open("ab") as log,
+    ):
+        server = make_server(data, redis.url, roots, listen)
+        workers = Workers(_command(data, redis.url, roots, count), count, log)
+        threads = [
+            threading.Thread(target=server.run, args=([listener],), name="service"),
+            threading.Thread(target=workers.keep_up, name="workers"),
+        ]
+        workers.begin()
+        try:
+            for thread in threads:
+                thread.start()
+            while not server.started:
+                if not threads[0].is_alive():
+                    raise FarmError("the service ended at once")
+                time.sleep(0.02)
+            host, port = listener.getsockname()[:2]
+            yield EmbeddedFarm(f"http://{_bracketed(host)}:{port}", redis.url, workers)
+        finally:
+            workers.end()
+            server.should_exit = True
+            for thread in threads:
+                thread.join()
+
+
+def _command(data: Path, redis_url: str, roots: list[Path], count: int) -> list[str]:
+    threads = max(1, machine.cores() // count)
+    memory = machine.memory_bytes() / count / (1 << 30)
+    command = [sys.executable, "-m", "pileus_worker", "--data", str(data), "--redis", redis_url]
+    command += [f"--threads={threads}", f"--memory={memory:.3f}"]
+    return [*command, *(f"--root={root}" for root in roots)]
+
+
+@contextlib.contextmanager
+def _alone_in(data: Path) -> Iterator[None]:
+    """Two farms over one folder would fight over its Redis."""
+    with (data / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"--data {data}: another farm runs there; stop it first") from None
+        yield
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,106 @@
+"""Plans a frame: which buckets the volume touches, what they cost, how to cut them into tasks."""
+
+import math
+import time
+from dataclasses import dataclass
+
+import pileus_core as core
+
+from pileus_service.jobs import Bucket, Part
+
+# Long enough to hide the cost of a task, short enough to lose little with a worker.
+TASK_SECONDS = 4.0
+SMALLEST = 32
+LARGEST = 512
+MAX_TASKS = 50_000
+PILOT_CELLS = 8
+PILOT_EDGE = 16
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Measured seconds a pixel sample, over a coarse grid of the image."""
+
+    cell: int
+    columns: int
+    seconds: list[float]
+
+    def at(self, x: int, y: int) -> float:
+        return self.seconds[(y // self.cell) * self.columns + x // self.cell]
+
+
+def tiles(width: int, height: int, edge: int) -> list[Bucket]:
+    """The image cut into squares; what is left over at the far edges is smaller."""
+    return [
+        (x, y, min(x + edge, width), min(y + edge, height))
+        for y in range(0, height, edge)
+        for x in range(0, width, edge)
+    ]
+
+
+def measure(
+    scene: core.Scene,
+    transport: core.Transport,
+    size: tuple[int, int],
+    *,
+    seed: int,
+    frame: int,
+    threads: int,
+    control: core.Control,
+) -> Cost:
+    """Renders one sample of a few pixels in each cell of a coarse grid, timed; cells alike in
+    cost need no more, and the whole takes about a thousandth of the frame."""
+    width, height = size
+    cell = math.ceil(max(width, height) / PILOT_CELLS)
+    seconds = []
+    for x0, y0, x1, y1 in tiles(width, height, cell):
+        x, y = max(x0, (x0 + x1 - PILOT_EDGE) // 2), max(y0, (y0 + y1 - PILOT_EDGE) // 2)
+        probe = (x, y, min(x + PILOT_EDGE, x1), min(y + PILOT_EDGE, y1))
+        begun = time.perf_counter()
+        core.render(
+            scene,
+            transport,
+            bucket=probe,
+            samples=(0, 1),
+            seed=seed,
+            frame=frame,
+            threads=threads,
+            control=control,
+        )
+        spent = time.perf_counter() - begun
+        seconds.append(spent / ((probe[2] - probe[0]) * (probe[3] - probe[1])))
+    return Cost(cell, math.ceil(width / cell), seconds)
+
+
+def cut(
+    scene: core.Scene, cost: Cost, size: tuple[int, int], samples: int
+) -> tuple[list[Part], list[Bucket]]:
+    """Parts of about TASK_SECONDS each, and the buckets that no ray of meets the volume."""
+    width, height = size
+    edge = LARGEST
+    while True:
+        buckets = tiles(width, height, edge)
+        dearest = max(_seconds(bucket, cost) for bucket in buckets) * samples
+        # Ranges of at least a few samples: below, the cost of a task is no longer hidden.
+        if edge == SMALLEST or dearest / TASK_SECONDS <= max(1, samples // 16):
+            break
+        edge //= 2
+    touched = [bucket for bucket in buckets if scene.touches(bucket)]
+    total = sum(_seconds(bucket, cost) for bucket in touched) * samples
+    task = max(TASK_SECONDS, total / MAX_TASKS)
+    parts = []
+    for bucket in touched:
+        count = min(samples, max(1, round(_seconds(bucket, cost) * samples / task)))
+        bounds = [samples * i // count for i in range(count + 1)]
+        parts += [Part(bucket=bucket, samples=(bounds[i], bounds[i + 1])) for i in range(count)]
+    touched_set = set(touched)
+    return parts, [bucket for bucket in buckets if bucket not in touched_set]
+
+
+def _seconds(bucket: Bucket, cost: Cost) -> float:
+    """Seconds for one sample of every pixel of the bucket, from the cells it lies in."""
+    x0, y0, x1, y1 = bucket
+    xs = {*range(x0, x1, cost.cell), x1 - 1}
+    ys = {*range(y0, y1, cost.cell), y1 - 1}
+    samples = [cost.at(x, y) for x in xs for y in ys]
+    return sum(samples) / len(samples) * (x1 - x0) * (y1 - y0)

@@ -1,0 +1,103 @@
+"""From a shot and a frame to the renderer's objects, and what an image's header says of them."""
+
+import hashlib
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import pileus_core as core
+
+from pileus_service import __version__
+from pileus_service.frames import expand
+from pileus_service.jobs import Cache
+from pileus_service.shot import DistantLight, Shot
+
+Header = dict[str, str | float | tuple[int, int] | list[float]]
+
+
+def cache_path(shot: Shot, frame: int) -> Path:
+    return Path(expand(shot.volumes[0].cache, frame))
+
+
+def cache_of(shot: Shot, frame: int) -> Cache:
+    """The cache file of a frame as it is on disk now."""
+    path = cache_path(shot, frame)
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise core.InputError(f"volumes.0.cache: {path}: {error.strerror}; mend the path") from None
+    return Cache(path=str(path), mtime_ns=found.st_mtime_ns, size=found.st_size)
+
+
+def make_camera(shot: Shot, frame: int) -> core.Camera:
+    pose = shot.camera.at(frame)
+    return core.Camera(position=pose.position, look_at=pose.look_at, up=pose.up, fov=pose.fov)
+
+
+def make_scene(shot: Shot, frame: int, volume: core.Volume) -> core.Scene:
+    medium = shot.volumes[0]
+    return core.Scene(
+        volume=volume,
+        extinction=medium.extinction,
+        albedo=medium.albedo,
+        anisotropy=medium.anisotropy,
+        camera=make_camera(shot, frame),
+        lights=[
+            core.DistantLight(
+                direction=light.direction, irradiance=light.irradiance, angle=light.angle
+            )
+            if isinstance(light, DistantLight)
+            else core.DomeLight(radiance=light.radiance, texture=light.texture or "")
+            for light in shot.lights
+        ],
+        width=shot.image.width,
+        height=shot.image.height,
+        background=shot.image.background,
+    )
+
+
+def make_transport(shot: Shot) -> core.Transport:
+    asked = shot.transport
+    looks = [core.Look(name=look.name, a=look.a, b=look.b, c=look.c) for look in asked.looks]
+    return core.Transport(method=asked.method, max_bounces=asked.max_bounces, looks=looks)
+
+
+def reason(shot: Shot) -> str:
+    """Why the transport is what it is."""
+    if shot.transport.max_bounces is None:
+        return "the shot names the method; the depth is the method's default"
+    return "the shot names the method and the depth"
+
+
+def identity(shot: Shot, frame: int, cache: Cache) -> str:
+    """A digest of all that a frame's pixels depend on; partials of another are no part of it."""
+    pixels = {
+        "frame": frame,
+        "cache": cache.model_dump(),
+        "camera": shot.camera.at(frame).model_dump(),
+        "image": shot.image.model_dump(exclude={"output", "pixel_type"}),
+        "version": core.__version__,
+        **shot.model_dump(mode="json", include={"volumes", "lights", "transport", "sampling"}),
+    }
+    return hashlib.sha256(json.dumps(pixels, sort_keys=True).encode()).hexdigest()
+
+
+def header(shot: Shot, frame: int, transport: core.Transport, seconds: float) -> Header:
+    """What a pipeline wants to know of an image."""
+    camera = make_camera(shot, frame)
+    rate = Fraction(shot.fps).limit_denominator(1001)
+    resolved = {
+        "method": shot.transport.method,
+        "max_bounces": transport.max_bounces,
+        "reason": reason(shot),
+    }
+    return {
+        "worldToCamera": camera.world_to_camera(),
+        "worldToNDC": camera.world_to_ndc(shot.image.width, shot.image.height),
+        "framesPerSecond": (rate.numerator, rate.denominator),
+        "renderTime": seconds,
+        "software": f"Pileus {__version__}",
+        "pileus.frame": str(frame),
+        "pileus.shot": shot.model_dump_json(),
+        "pileus.transport": json.dumps(resolved),
+    }
