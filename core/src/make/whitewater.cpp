@@ -431,7 +431,7 @@ class Splash {
                                smoothstep(0.90F, 0.45F, std::abs(at.x[i]));
             const float turmoil = 0.25F + 0.75F * std::min(1.0F, heave[i] * 14.0F);
             const float top = height[i] + bumps[i] * turmoil;
-            const float depth = (0.010F + 0.05F * near) + heave[i];
+            const float depth = (0.014F + 0.05F * near) + heave[i];
             const float above = (at.y[i] - top) / voxel_;
             const float below = (top - depth - at.y[i]) / voxel_;
             const float web = 0.55F * coarse[i] + 0.45F * fine[i];
