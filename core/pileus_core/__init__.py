@@ -1,0 +1,43 @@
+"""The Pileus renderer: volumes, transport methods, and the merge of partial images."""
+
+from ._core import (
+    METHODS,
+    Camera,
+    Cancelled,
+    Control,
+    DistantLight,
+    DomeLight,
+    Frame,
+    InputError,
+    Look,
+    Partial,
+    Scene,
+    Transport,
+    Volume,
+    __version__,
+    make_cloud,
+    make_whitewater,
+    read_image,
+    render,
+)
+
+__all__ = [
+    "METHODS",
+    "Camera",
+    "Cancelled",
+    "Control",
+    "DistantLight",
+    "DomeLight",
+    "Frame",
+    "InputError",
+    "Look",
+    "Partial",
+    "Scene",
+    "Transport",
+    "Volume",
+    "__version__",
+    "make_cloud",
+    "make_whitewater",
+    "read_image",
+    "render",
+]

@@ -1,0 +1,160 @@
+// The sampling structure: 8^3 bricks of half floats under nodes of 8^3 children, as many levels of
+// nodes as the grid is wide. Each child carries exact bounds of the trilinearly interpolated field
+// over its cells, so that a ray crosses empty space in a few steps and every majorant is local
+// (after Museth 2013, whose tree it is built from, and the hierarchical DDA of Museth 2014).
+#pragma once
+
+#include "geometry.h"
+
+#include <array>
+#include <bit>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+namespace pileus {
+
+/// A non-negative half float. Decoded with integer arithmetic alone: no F16C is needed.
+using Half = std::uint16_t;
+
+/// The half's bits moved into a float's place are the value times 2^-112.
+constexpr float decode_half(Half h) {
+    return std::bit_cast<float>(static_cast<std::uint32_t>(h) << 13) * 0x1p112f;
+}
+
+/// Rounds a value in [0, 65504] to the nearest half, ties to even.
+constexpr Half encode_half(float value) {
+    const auto bits = std::bit_cast<std::uint32_t>(value * 0x1p-112f);
+    return static_cast<Half>((bits + 0xfffu + ((bits >> 13) & 1u)) >> 13);
+}
+
+/// Least and greatest value of the interpolated field over some cells.
+struct Bounds {
+    float min = std::numeric_limits<float>::infinity();
+    float max = 0.0f;
+    void include(const Bounds& other) {
+        min = std::min(min, other.min);
+        max = std::max(max, other.max);
+    }
+};
+
+/// A sparse field of non-negative values at integer coordinates, zero where nothing is stored.
+/// Coordinates are local: they start at (0, 0, 0) in the corner of the root.
+class BrickTree {
+  public:
+    static constexpr int log2_width = 3;
+    static constexpr int width = 1 << log2_width;
+    static constexpr int entries = width * width * width;
+
+    using Brick = std::array<Half, entries>;
+
+    /// A child is a brick or node by number, or, with the top bit set, one value throughout.
+    using Child = std::uint32_t;
+    static constexpr Child constant_bit = 0x80000000u;
+    static constexpr Child constant(Half value) { return constant_bit | value; }
+
+    struct Node {
+        std::array<Child, entries> child;
+        std::array<Half, entries> min, max;
+    };
+
+    /// The largest box of cells around a point on which the tree has one pair of bounds to offer.
+    struct Cells {
+        V3i low;
+        int size;
+        float majorant;
+    };
+
+    BrickTree() = default;
+
+    bool empty() const { return nodes_.empty(); }
+
+    /// Cells across the root, in each dimension.
+    int extent() const { return extent_; }
+
+    /// The least and greatest cell that holds anything, local coordinates: [low, high).
+    const V3i& low() const { return low_; }
+    const V3i& high() const { return high_; }
+
+    const Bounds& bounds() const { return bounds_; }
+
+    std::size_t bytes() const {
+        return nodes_.capacity() * sizeof(Node) + bricks_.capacity() * sizeof(Brick);
+    }
+
+    bool contains(const V3i& cell) const {
+        const auto limit = static_cast<unsigned>(extent_);
+        return static_cast<unsigned>(cell.x) < limit && static_cast<unsigned>(cell.y) < limit &&
+               static_cast<unsigned>(cell.z) < limit;
+    }
+
+    /// The value at integer coordinates.
+    float voxel(const V3i& at) const {
+        if (!contains(at)) return 0.0f;
+        const Child found = descend(at);
+        return scale_ * decode_half(found & constant_bit ? static_cast<Half>(found)
+                                                         : bricks_[found][entry(at, 0)]);
+    }
+
+    /// The field at x, interpolated trilinearly between the eight voxels around it.
+    float interpolate(const V3f& x) const;
+
+    /// The value of one of the eight voxels around x, drawn with its interpolation weight: its mean
+    /// is the interpolated field. The three jitters are uniform in [0, 1).
+    float tap(const V3f& x, const V3f& jitter) const {
+        return voxel(
+            V3i(floor_int(x.x + jitter.x), floor_int(x.y + jitter.y), floor_int(x.z + jitter.z)));
+    }
+
+    /// The cells around one cell inside the root, with the majorant of the field over them.
+    Cells cells(const V3i& cell) const {
+        const Node* node = &nodes_[0];
+        for (int level = levels_;; --level) {
+            const int shift = log2_width * level;
+            const unsigned e = entry(cell, shift);
+            const Child child = node->child[e];
+            const Half majorant = node->max[e];
+            if (level == 1 || majorant == 0 || (child & constant_bit)) {
+                const int mask = ~((1 << shift) - 1);
+                return {V3i(cell.x & mask, cell.y & mask, cell.z & mask), 1 << shift,
+                        scale_ * decode_half(majorant)};
+            }
+            node = &nodes_[child];
+        }
+    }
+
+    static int floor_int(float x) {
+        const int truncated = static_cast<int>(x);
+        return truncated - (static_cast<float>(truncated) > x);
+    }
+
+  private:
+    friend class BrickTreeBuilder;
+
+    static constexpr unsigned entry(const V3i& at, int shift) {
+        constexpr int mask = width - 1;
+        return static_cast<unsigned>((((at.x >> shift) & mask) << (2 * log2_width)) |
+                                     (((at.y >> shift) & mask) << log2_width) |
+                                     ((at.z >> shift) & mask));
+    }
+
+    /// The brick or constant that holds a voxel inside the root.
+    Child descend(const V3i& at) const {
+        Child child = 0;
+        for (int level = levels_; level > 0; --level) {
+            child = nodes_[child].child[entry(at, log2_width * level)];
+            if (child & constant_bit) break;
+        }
+        return child;
+    }
+
+    std::vector<Node> nodes_;  // the root first
+    std::vector<Brick> bricks_;
+    int levels_ = 0;  // of nodes; a child at level l is width^l cells wide
+    int extent_ = 0;
+    float scale_ = 1.0f;  // a power of two: halves hold value / scale
+    V3i low_{0}, high_{0};
+    Bounds bounds_{0.0f, 0.0f};
+};
+
+}  // namespace pileus

@@ -1,0 +1,366 @@
+#include "brick_tree_builder.h"
+
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+#include <tbb/parallel_reduce.h>
+
+#include <cmath>
+#include <string>
+
+namespace pileus {
+
+namespace {
+
+using openvdb::Coord;
+using openvdb::CoordBBox;
+
+V3i to_v3i(const Coord& c) { return {c.x(), c.y(), c.z()}; }
+
+/// A density as the renderer takes it; what it cannot be becomes zero.
+template <class Value>
+float sanitized(Value value) {
+    const bool valid = value > Value(0) && std::isfinite(value);
+    return valid ? static_cast<float>(std::min<Value>(value, std::numeric_limits<float>::max()))
+                 : 0.0f;
+}
+
+template <class Value>
+void count(Value value, std::int64_t times, Census& census) {
+    if (std::isnan(value)) {
+        census.nan += times;
+    } else if (std::isinf(value)) {
+        census.infinite += times;
+    } else if (value < Value(0)) {
+        census.negative += times;
+    }
+}
+
+struct Range {
+    Half min = 0xffff, max = 0;
+    void include(Range other) {
+        min = std::min(min, other.min);
+        max = std::max(max, other.max);
+    }
+};
+
+/// The range of a brick's voxels over each of its low sides: element m covers the voxels whose
+/// coordinate is 0 along every axis whose bit (4 = x, 2 = y, 1 = z) is set in m; element 0 covers
+/// them all.
+using Sides = std::array<Range, 8>;
+
+Sides sides_of(const BrickTree::Brick& brick) {
+    Sides sides;
+    for (unsigned i = 0; i < BrickTree::entries; ++i) {
+        const unsigned zero =
+            ((i >> 6) == 0 ? 4u : 0u) | ((i >> 3 & 7) == 0 ? 2u : 0u) | ((i & 7) == 0 ? 1u : 0u);
+        const Range value{brick[i], brick[i]};
+        // Only low sides have more than element 0 to feed: 169 of the 512 voxels.
+        for (unsigned m = zero;; m = (m - 1) & zero) {
+            sides[m].include(value);
+            if (m == 0) break;
+        }
+    }
+    return sides;
+}
+
+template <class Value>
+struct Tile {
+    CoordBBox box;
+    Value value;
+};
+
+}  // namespace
+
+/// Fills the private parts of a tree whose size is known.
+class BrickTreeBuilder {
+  public:
+    BrickTreeBuilder(int levels, std::size_t brick_count) {
+        tree_.levels_ = levels;
+        tree_.extent_ = 1 << (BrickTree::log2_width * (levels + 1));
+        tree_.bricks_.resize(brick_count);
+        sides_.resize(brick_count);
+        add_node(levels, V3i(0), BrickTree::constant(0));
+    }
+
+    void set_scale(float scale) { tree_.scale_ = scale; }
+    float scale() const { return tree_.scale_; }
+
+    BrickTree::Brick& brick(std::size_t number) { return tree_.bricks_[number]; }
+    void measure(std::size_t number) { sides_[number] = sides_of(tree_.bricks_[number]); }
+
+    /// Hangs a measured brick into the tree.
+    void insert(std::size_t number, const V3i& low) {
+        Node& node = tree_.nodes_[lowest_node(low)];
+        node.child[BrickTree::entry(low, BrickTree::log2_width)] = static_cast<Child>(number);
+        // The cells just below a side with something on it see that side, so they need bounds of
+        // their own.
+        for (unsigned m = 1; m < 8; ++m) {
+            if (sides_[number][m].max > 0) lowest_node(low - side_offset(m));
+        }
+    }
+
+    /// Gives the 8-aligned box [low, high) one value. Its interior may stay coarse; the cells that
+    /// touch other values, on its high side and just below its low side, get nodes of the finest
+    /// level.
+    void fill(const V3i& low, const V3i& high, Half value) {
+        constexpr int w = BrickTree::width;
+        fill(0, low, high - V3i(w), value);
+        for (int x = low.x - w; x < high.x; x += w) {
+            for (int y = low.y - w; y < high.y; y += w) {
+                for (int z = low.z - w; z < high.z; z += w) {
+                    const bool below = x < low.x || y < low.y || z < low.z;
+                    const bool shell = x == high.x - w || y == high.y - w || z == high.z - w;
+                    if (!below && !shell) {
+                        z = std::max(z, high.z - 2 * w);
+                        continue;
+                    }
+                    Node& node = tree_.nodes_[lowest_node(V3i(x, y, z))];
+                    if (!below)
+                        node.child[BrickTree::entry(V3i(x, y, z), BrickTree::log2_width)] =
+                            BrickTree::constant(value);
+                }
+            }
+        }
+    }
+
+    /// Computes all bounds, and gives the tree away.
+    BrickTree finish(const V3i& low, const V3i& high) {
+        using NodeRange = tbb::blocked_range<std::size_t>;
+        tbb::parallel_for(NodeRange(0, tree_.nodes_.size()), [&](const NodeRange& range) {
+            for (std::size_t n = range.begin(); n != range.end(); ++n) {
+                if (level_[n] == 1) bound_lowest(n);
+            }
+        });
+        // A node comes before its children, so backwards each finds them done.
+        for (std::size_t n = tree_.nodes_.size(); n-- > 0;) {
+            if (level_[n] > 1) bound_inner(n);
+        }
+        const Range all = range_of(0);
+        tree_.bounds_ = {tree_.scale_ * decode_half(all.min), tree_.scale_ * decode_half(all.max)};
+        tree_.low_ = low;
+        tree_.high_ = high;
+        tree_.nodes_.shrink_to_fit();
+        return std::move(tree_);
+    }
+
+  private:
+    using Node = BrickTree::Node;
+    using Child = BrickTree::Child;
+
+    static V3i side_offset(unsigned m) {
+        constexpr int w = BrickTree::width;
+        return {m & 4 ? w : 0, m & 2 ? w : 0, m & 1 ? w : 0};
+    }
+
+    Child add_node(int level, const V3i& low, Child children) {
+        Node& node = tree_.nodes_.emplace_back();
+        node.child.fill(children);
+        level_.push_back(static_cast<std::uint8_t>(level));
+        low_.push_back(low);
+        return static_cast<Child>(tree_.nodes_.size() - 1);
+    }
+
+    /// The node behind an entry, made where there was only a constant.
+    std::size_t child_node(std::size_t parent, unsigned entry, const V3i& low) {
+        const Child child = tree_.nodes_[parent].child[entry];
+        if (!(child & BrickTree::constant_bit)) return child;
+        const Child made = add_node(level_[parent] - 1, low, child);
+        tree_.nodes_[parent].child[entry] = made;
+        return made;
+    }
+
+    std::size_t lowest_node(const V3i& at) {
+        std::size_t node = 0;
+        for (int level = tree_.levels_; level > 1; --level) {
+            const int shift = BrickTree::log2_width * level;
+            const int mask = ~((1 << shift) - 1);
+            node = child_node(node, BrickTree::entry(at, shift),
+                              V3i(at.x & mask, at.y & mask, at.z & mask));
+        }
+        return node;
+    }
+
+    void fill(std::size_t n, const V3i& low, const V3i& high, Half value) {
+        if (low.x >= high.x || low.y >= high.y || low.z >= high.z) return;
+        const int shift = BrickTree::log2_width * level_[n];
+        const int size = 1 << shift;
+        const V3i corner = low_[n];
+        const auto first = [&](int a, int c) { return std::max(a, c) & ~(size - 1); };
+        const auto last = [&](int b, int c) { return std::min(b, c + size * BrickTree::width); };
+        for (int x = first(low.x, corner.x); x < last(high.x, corner.x); x += size) {
+            for (int y = first(low.y, corner.y); y < last(high.y, corner.y); y += size) {
+                for (int z = first(low.z, corner.z); z < last(high.z, corner.z); z += size) {
+                    const V3i child_low(x, y, z);
+                    const unsigned entry = BrickTree::entry(child_low, shift);
+                    const bool covered = x >= low.x && y >= low.y && z >= low.z &&
+                                         x + size <= high.x && y + size <= high.y &&
+                                         z + size <= high.z;
+                    if (covered) {
+                        tree_.nodes_[n].child[entry] = BrickTree::constant(value);
+                    } else {
+                        fill(child_node(n, entry, child_low), low, high, value);
+                    }
+                }
+            }
+        }
+    }
+
+    void bound_lowest(std::size_t n) {
+        constexpr int w = BrickTree::width;
+        Node& node = tree_.nodes_[n];
+        for (int i = 0; i < BrickTree::entries; ++i) {
+            const V3i low = low_[n] + V3i((i >> 6) * w, (i >> 3 & 7) * w, (i & 7) * w);
+            Range range;
+            for (unsigned m = 0; m < 8; ++m) {
+                const V3i at = low + side_offset(m);
+                const Child found = tree_.contains(at) ? tree_.descend(at) : BrickTree::constant(0);
+                const auto value = static_cast<Half>(found);
+                range.include(found & BrickTree::constant_bit ? Range{value, value}
+                                                              : sides_[found][m]);
+            }
+            node.min[static_cast<unsigned>(i)] = range.min;
+            node.max[static_cast<unsigned>(i)] = range.max;
+        }
+    }
+
+    void bound_inner(std::size_t n) {
+        Node& node = tree_.nodes_[n];
+        for (unsigned i = 0; i < BrickTree::entries; ++i) {
+            const Child child = node.child[i];
+            const auto value = static_cast<Half>(child);
+            const Range range =
+                child & BrickTree::constant_bit ? Range{value, value} : range_of(child);
+            node.min[i] = range.min;
+            node.max[i] = range.max;
+        }
+    }
+
+    Range range_of(std::size_t n) const {
+        const Node& node = tree_.nodes_[n];
+        Range range;
+        for (unsigned i = 0; i < BrickTree::entries; ++i) range.include({node.min[i], node.max[i]});
+        return range;
+    }
+
+    BrickTree tree_;
+    std::vector<Sides> sides_;         // of each brick
+    std::vector<std::uint8_t> level_;  // of each node
+    std::vector<V3i> low_;             // of each node
+};
+
+namespace {
+
+/// Tiles above the leaves that hold something.
+template <class Tree>
+auto collect_tiles(const Tree& tree, Census& census) {
+    std::vector<Tile<typename Tree::ValueType>> tiles;
+    auto it = tree.cbeginValueAll();
+    it.setMaxDepth(Tree::ValueAllCIter::LEAF_DEPTH - 1);
+    for (; it; ++it) {
+        if (it.isValueOn()) count(*it, static_cast<std::int64_t>(it.getVoxelCount()), census);
+        if (*it == tree.background() || sanitized(*it) == 0.0f) continue;
+        CoordBBox box;
+        it.getBoundingBox(box);
+        tiles.push_back({box, *it});
+    }
+    return tiles;
+}
+
+template <class Tree>
+BuiltTree build(const Tree& tree) {
+    using Value = typename Tree::ValueType;
+    using Leaf = typename Tree::LeafNodeType;
+    using LeafRange = tbb::blocked_range<std::size_t>;
+    static_assert(Leaf::DIM == BrickTree::width);
+
+    BuiltTree built;
+    const auto tiles = collect_tiles(tree, built.census);
+    std::vector<const Leaf*> leaves;
+    tree.getNodes(leaves);
+    // A value outside the stored region would fill all space; a density that is not zero there is
+    // not one.
+    const Value background = tree.background();
+    const auto density = [background](Value value) {
+        return value == background ? 0.0f : sanitized(value);
+    };
+
+    // The first pass reads what OpenVDB left on disk, counts, and finds what is there at all.
+    std::vector<float> greatest(leaves.size());
+    built.census += tbb::parallel_reduce(
+        LeafRange(0, leaves.size()), Census{},
+        [&](const LeafRange& range, Census census) {
+            for (std::size_t l = range.begin(); l != range.end(); ++l) {
+                const Value* const values = leaves[l]->buffer().data();
+                bool odd = false;
+                float max = 0.0f;
+                for (unsigned i = 0; i < Leaf::SIZE; ++i) {
+                    max = std::max(max, density(values[i]));
+                    odd |= !(values[i] >= Value(0)) || std::isinf(values[i]);
+                }
+                greatest[l] = max;
+                if (!odd) continue;
+                for (auto it = leaves[l]->cbeginValueOn(); it; ++it) count(*it, 1, census);
+            }
+            return census;
+        },
+        [](Census a, const Census& b) { return a += b; });
+
+    float max = 0.0f;
+    CoordBBox box;
+    std::size_t kept = 0;
+    for (std::size_t l = 0; l < leaves.size(); ++l) {
+        if (greatest[l] == 0.0f) continue;
+        max = std::max(max, greatest[l]);
+        box.expand(leaves[l]->getNodeBoundingBox());
+        leaves[kept++] = leaves[l];
+    }
+    leaves.resize(kept);
+    for (const auto& tile : tiles) {
+        max = std::max(max, sanitized(tile.value));
+        box.expand(tile.box);
+    }
+    if (box.empty()) return built;
+
+    // One brick of margin below: the cells there interpolate towards the first voxels.
+    built.origin = to_v3i(box.min()) - V3i(BrickTree::width);
+    std::int64_t extent = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+        extent = std::max(extent, std::int64_t{box.max()[axis]} + 1 - built.origin[axis]);
+    }
+    if (extent > widest_extent) {
+        throw TooWide("spans " + std::to_string(extent) + " voxels; at most " +
+                      std::to_string(widest_extent) + " can be resolved");
+    }
+    int levels = 1;
+    while ((std::int64_t{1} << (BrickTree::log2_width * (levels + 1))) < extent) ++levels;
+
+    BrickTreeBuilder builder(levels, leaves.size());
+    // The greatest value lands in the upper half of the halves' range: small ones keep their
+    // precision.
+    builder.set_scale(std::ldexp(1.0f, std::max(std::ilogb(max) - 14, -100)));
+    const float inverse_scale = 1.0f / builder.scale();
+    tbb::parallel_for(LeafRange(0, leaves.size()), [&](const LeafRange& range) {
+        for (std::size_t l = range.begin(); l != range.end(); ++l) {
+            const Value* const values = leaves[l]->buffer().data();
+            BrickTree::Brick& brick = builder.brick(l);
+            for (unsigned i = 0; i < Leaf::SIZE; ++i)
+                brick[i] = encode_half(density(values[i]) * inverse_scale);
+            builder.measure(l);
+        }
+    });
+    const auto local = [&](const Coord& c) { return to_v3i(c) - built.origin; };
+    for (const auto& tile : tiles) {
+        builder.fill(local(tile.box.min()), local(tile.box.max().offsetBy(1)),
+                     encode_half(sanitized(tile.value) * inverse_scale));
+    }
+    for (std::size_t l = 0; l < leaves.size(); ++l) builder.insert(l, local(leaves[l]->origin()));
+    built.tree = builder.finish(local(box.min()) - V3i(1), local(box.max()) + V3i(1));
+    return built;
+}
+
+}  // namespace
+
+BuiltTree build_brick_tree(const openvdb::FloatTree& tree) { return build(tree); }
+BuiltTree build_brick_tree(const openvdb::DoubleTree& tree) { return build(tree); }
+
+}  // namespace pileus

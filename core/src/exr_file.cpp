@@ -1,0 +1,189 @@
+#include "exr_file.h"
+
+#include "error.h"
+
+#include <OpenEXR/ImfChannelList.h>
+#include <OpenEXR/ImfFloatAttribute.h>
+#include <OpenEXR/ImfFrameBuffer.h>
+#include <OpenEXR/ImfHeader.h>
+#include <OpenEXR/ImfInputPart.h>
+#include <OpenEXR/ImfMatrixAttribute.h>
+#include <OpenEXR/ImfMultiPartInputFile.h>
+#include <OpenEXR/ImfMultiPartOutputFile.h>
+#include <OpenEXR/ImfOutputPart.h>
+#include <OpenEXR/ImfPartType.h>
+#include <OpenEXR/ImfRationalAttribute.h>
+#include <OpenEXR/ImfStringAttribute.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstring>
+#include <fcntl.h>
+#include <filesystem>
+#include <unistd.h>
+
+namespace pileus {
+
+namespace {
+
+constexpr float greatest_half = 65504.0f;
+
+bool stays_float(const std::string& channel) {
+    return channel == "Z" || channel.starts_with("variance.");
+}
+
+void set_attribute(Imf::Header& header, const std::string& name, const HeaderValue& value) {
+    struct Visitor {
+        Imf::Header& header;
+        const char* name;
+        void operator()(const std::string& text) const {
+            header.insert(name, Imf::StringAttribute(text));
+        }
+        void operator()(float number) const { header.insert(name, Imf::FloatAttribute(number)); }
+        void operator()(const std::pair<int, unsigned>& ratio) const {
+            header.insert(name, Imf::RationalAttribute(Imf::Rational(ratio.first, ratio.second)));
+        }
+        void operator()(const Imath::M44f& matrix) const {
+            header.insert(name, Imf::M44fAttribute(matrix));
+        }
+    };
+    std::visit(Visitor{header, name.c_str()}, value);
+}
+
+/// OpenEXR's frame buffers address pixels from the data window's origin, which may lie before the
+/// data.
+template <class Sample>
+char* origin_of(Sample* first, const Bucket& window) {
+    const std::ptrdiff_t offset = std::ptrdiff_t{window.y0} * window.width() + window.x0;
+    return reinterpret_cast<char*>(reinterpret_cast<std::intptr_t>(first) -
+                                   offset * static_cast<std::ptrdiff_t>(sizeof(Sample)));
+}
+
+template <class Sample>
+Imf::Slice slice(Imf::PixelType type, const Sample* first, const Bucket& window) {
+    return {type, origin_of(const_cast<Sample*>(first), window), sizeof(Sample),
+            sizeof(Sample) * static_cast<std::size_t>(window.width())};
+}
+
+Imath::Box2i box_of(const Bucket& b) { return {{b.x0, b.y0}, {b.x1 - 1, b.y1 - 1}}; }
+
+void write_parts(const std::string& path, const LayeredImage& image, int width, int height,
+                 bool half, const Header& attributes) {
+    std::vector<Imf::Header> headers;
+    for (const std::string& look : image.looks()) {
+        Imf::Header header(Imath::Box2i({0, 0}, {width - 1, height - 1}), box_of(image.window()));
+        header.setName(look);
+        header.setType(Imf::SCANLINEIMAGE);
+        header.compression() = Imf::ZIP_COMPRESSION;
+        for (const std::string& channel : image.channels()) {
+            header.channels().insert(
+                channel, Imf::Channel(half && !stays_float(channel) ? Imf::HALF : Imf::FLOAT));
+        }
+        for (const auto& [name, value] : attributes) set_attribute(header, name, value);
+        headers.push_back(header);
+    }
+    Imf::MultiPartOutputFile file(path.c_str(), headers.data(), static_cast<int>(headers.size()));
+    for (std::size_t look = 0; look < image.looks().size(); ++look) {
+        Imf::FrameBuffer buffer;
+        std::vector<std::vector<::half>> halves(image.channels().size());
+        for (std::size_t c = 0; c < image.channels().size(); ++c) {
+            const std::string& channel = image.channels()[c];
+            const float* const plane = image.plane(look, c);
+            if (!half || stays_float(channel)) {
+                buffer.insert(channel, slice(Imf::FLOAT, plane, image.window()));
+                continue;
+            }
+            halves[c].resize(image.window().pixels());
+            std::transform(plane, plane + halves[c].size(), halves[c].begin(),
+                           [](float value) { return ::half(std::min(value, greatest_half)); });
+            buffer.insert(channel, slice(Imf::HALF, halves[c].data(), image.window()));
+        }
+        Imf::OutputPart part(file, static_cast<int>(look));
+        part.setFrameBuffer(buffer);
+        part.writePixels(image.window().height());
+    }
+}
+
+void sync_to_disk(const std::string& path) {
+    const int file = ::open(path.c_str(), O_RDONLY);
+    const bool synced = file >= 0 && ::fsync(file) == 0;
+    const int reason = errno;
+    if (file >= 0) ::close(file);
+    if (!synced) throw std::runtime_error(std::strerror(reason));
+}
+
+}  // namespace
+
+LayeredImage::LayeredImage(const Bucket& window, std::vector<std::string> looks,
+                           std::vector<std::string> channels)
+    : window_(window),
+      looks_(std::move(looks)),
+      channels_(std::move(channels)),
+      data_(looks_.size() * channels_.size() * window.pixels()) {}
+
+std::size_t LayeredImage::look_index(const std::string& name) const {
+    const auto found = std::find(looks_.begin(), looks_.end(), name);
+    if (found == looks_.end()) throw InputError("there is no look \"" + name + "\" in this image");
+    return static_cast<std::size_t>(found - looks_.begin());
+}
+
+void write_exr(const std::string& path, const LayeredImage& image, int width, int height, bool half,
+               const Header& header) {
+    const std::string temporary = path + "." + std::to_string(::getpid()) + ".tmp";
+    try {
+        write_parts(temporary, image, width, height, half, header);
+        sync_to_disk(temporary);
+        std::filesystem::rename(temporary, path);
+        sync_to_disk(std::filesystem::absolute(path).parent_path().string());
+    } catch (const std::exception& error) {
+        std::error_code ignored;
+        std::filesystem::remove(temporary, ignored);
+        throw std::runtime_error(path + ": cannot be written (" + error.what() + ")");
+    }
+}
+
+ExrFile read_exr(const std::string& path) {
+    try {
+        Imf::MultiPartInputFile file(path.c_str());
+        ExrFile result;
+        const Imath::Box2i data = file.header(0).dataWindow(),
+                           display = file.header(0).displayWindow();
+        const Bucket window{data.min.x, data.min.y, data.max.x + 1, data.max.y + 1};
+        result.width = display.max.x + 1 - display.min.x;
+        result.height = display.max.y + 1 - display.min.y;
+
+        std::vector<std::string> looks, channels;
+        for (int p = 0; p < file.parts(); ++p) {
+            const Imf::Header& header = file.header(p);
+            looks.push_back(header.hasName() ? header.name() : "");
+            std::vector<std::string> names;
+            for (auto c = header.channels().begin(); c != header.channels().end(); ++c)
+                names.emplace_back(c.name());
+            if (p == 0) channels = names;
+            if (names != channels || header.dataWindow() != data)
+                throw InputError("its parts differ in channels or size");
+        }
+        result.image = LayeredImage(window, looks, channels);
+        for (int p = 0; p < file.parts(); ++p) {
+            Imf::FrameBuffer buffer;
+            for (std::size_t c = 0; c < channels.size(); ++c) {
+                buffer.insert(
+                    channels[c],
+                    slice(Imf::FLOAT, result.image.plane(static_cast<std::size_t>(p), c), window));
+            }
+            Imf::InputPart part(file, p);
+            part.setFrameBuffer(buffer);
+            part.readPixels(data.min.y, data.max.y);
+        }
+        for (auto it = file.header(0).begin(); it != file.header(0).end(); ++it) {
+            if (const auto* text = dynamic_cast<const Imf::StringAttribute*>(&it.attribute())) {
+                result.text[it.name()] = text->value();
+            }
+        }
+        return result;
+    } catch (const std::exception& error) {
+        throw InputError(path + ": cannot be read as an EXR image (" + error.what() + ")");
+    }
+}
+
+}  // namespace pileus

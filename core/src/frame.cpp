@@ -1,0 +1,108 @@
+#include "frame.h"
+
+#include "error.h"
+
+#include <algorithm>
+
+namespace pileus {
+
+namespace {
+
+std::string text(const Bucket& b) {
+    return "bucket (" + std::to_string(b.x0) + ", " + std::to_string(b.y0) + ")-(" +
+           std::to_string(b.x1) + ", " + std::to_string(b.y1) + ")";
+}
+
+std::string text(const SampleRange& range) {
+    return "samples [" + std::to_string(range.first) + ", " + std::to_string(range.last) + ")";
+}
+
+}  // namespace
+
+Frame::Frame(int width, int height, std::vector<std::pair<Bucket, int>> plan)
+    : width_(width), height_(height) {
+    std::vector<bool> covered(static_cast<std::size_t>(width) * static_cast<std::size_t>(height));
+    for (const auto& [bucket, samples] : plan) {
+        if (bucket.x0 < 0 || bucket.y0 < 0 || bucket.x1 > width || bucket.y1 > height ||
+            bucket.width() < 1 || bucket.height() < 1 || samples < 1) {
+            throw InputError("the plan's " + text(bucket) + " is empty or lies outside the image");
+        }
+        for (int y = bucket.y0; y < bucket.y1; ++y) {
+            for (int x = bucket.x0; x < bucket.x1; ++x) {
+                auto pixel = covered[static_cast<std::size_t>(y) * static_cast<std::size_t>(width) +
+                                     static_cast<std::size_t>(x)];
+                if (pixel) throw InputError("the plan's " + text(bucket) + " overlaps another");
+                pixel = true;
+            }
+        }
+        tiles_.push_back({bucket, samples, {}});
+    }
+    if (std::find(covered.begin(), covered.end(), false) != covered.end()) {
+        throw InputError("the plan's buckets leave pixels uncovered");
+    }
+}
+
+void Frame::add(const Partial& partial) {
+    const Bucket& window = partial.image.window();
+    const auto tile = std::find_if(tiles_.begin(), tiles_.end(),
+                                   [&](const Tile& t) { return t.bucket == window; });
+    if (tile == tiles_.end()) throw InputError(text(window) + " is not in this frame's plan");
+    if (partial.width != width_ || partial.height != height_) {
+        throw InputError(text(window) + " belongs to an image of another size");
+    }
+    if (image_.looks().empty()) {
+        image_ =
+            LayeredImage({0, 0, width_, height_}, partial.image.looks(), partial.image.channels());
+        identity_ = partial.identity;
+    } else if (partial.identity != identity_ || partial.image.looks() != image_.looks() ||
+               partial.image.channels() != image_.channels()) {
+        throw InputError(text(window) + ", " + text(partial.samples) +
+                         " is of another frame (identity, looks or orders differ)");
+    }
+    const int reached = tile->partial.samples.last;
+    if (partial.samples.count() < 1 || partial.samples.first != reached ||
+        partial.samples.last > tile->wanted) {
+        throw InputError(text(window) + ": " + text(partial.samples) + " does not follow the " +
+                         std::to_string(reached) + " samples that are there, of " +
+                         std::to_string(tile->wanted));
+    }
+    if (reached == 0) {
+        tile->partial = partial;
+    } else {
+        tile->partial.pool(partial);
+    }
+    if (tile->partial.samples.last == tile->wanted) {
+        place(*tile);
+        tile->partial.image = {};
+    }
+}
+
+void Frame::place(const Tile& tile) {
+    const LayeredImage& source = tile.partial.image;
+    const Bucket& window = tile.bucket;
+    for (std::size_t look = 0; look < source.looks().size(); ++look) {
+        for (std::size_t c = 0; c < source.channels().size(); ++c) {
+            for (int y = 0; y < window.height(); ++y) {
+                std::copy_n(
+                    source.plane(look, c) + std::ptrdiff_t{y} * window.width(), window.width(),
+                    image_.plane(look, c) + std::ptrdiff_t{window.y0 + y} * width_ + window.x0);
+            }
+        }
+    }
+}
+
+void Frame::require_complete() const {
+    for (const Tile& tile : tiles_) {
+        if (tile.partial.samples.last == tile.wanted) continue;
+        throw InputError(text(tile.bucket) + " has " + std::to_string(tile.partial.samples.last) +
+                         " of its " + std::to_string(tile.wanted) + " samples; render " +
+                         text(SampleRange{tile.partial.samples.last, tile.wanted}));
+    }
+}
+
+void Frame::write(const std::string& path, bool half, const Header& header) const {
+    require_complete();
+    write_exr(path, image_, width_, height_, half, header);
+}
+
+}  // namespace pileus

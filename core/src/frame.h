@@ -1,0 +1,45 @@
+// The merge: partials put together into a frame, which is written only when nothing is missing.
+#pragma once
+
+#include "partial.h"
+
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace pileus {
+
+class Frame {
+  public:
+    /// The buckets and how many samples each must reach. Throws InputError unless they tile the
+    /// image exactly.
+    Frame(int width, int height, std::vector<std::pair<Bucket, int>> plan);
+
+    /// Takes the next samples of a bucket; those of one bucket must come in order. Throws
+    /// InputError for a partial that is not of the plan, overlaps what is there, leaves a gap, or
+    /// is of another frame.
+    void add(const Partial& partial);
+
+    /// Writes the whole image. Throws InputError where a bucket lacks samples, std::runtime_error
+    /// where the file cannot be written.
+    void write(const std::string& path, bool half, const Header& header) const;
+
+    const LayeredImage& image() const { return image_; }
+
+  private:
+    struct Tile {
+        Bucket bucket;
+        int wanted;
+        Partial partial;  // what has come so far
+    };
+
+    void require_complete() const;
+    void place(const Tile& tile);
+
+    int width_, height_;
+    std::vector<Tile> tiles_;
+    std::string identity_;
+    LayeredImage image_;
+};
+
+}  // namespace pileus

@@ -1,0 +1,75 @@
+// A volume as light meets it: extinction, albedo and phase function over a density field. Every
+// medium answers two questions, the extinction at a point and the majorants along a ray; all
+// tracking is written over these (the arrangement of pbrt-v4's media, Pharr, Jakob & Humphreys
+// 2023).
+#pragma once
+
+#include "majorants.h"
+#include "phase.h"
+#include "random.h"
+#include "volume.h"
+
+namespace pileus {
+
+class Medium {
+  public:
+    /// `extinction` is sigma_t at density 1, per world unit. The volume must outlive the medium.
+    Medium(const Volume& volume, float extinction, const Color& albedo, float anisotropy)
+        : volume_(&volume),
+          tree_(&volume.tree()),
+          extinction_(extinction),
+          albedo_(albedo),
+          phase_(anisotropy) {
+        const Imath::M44d& m = volume.world_to_local();
+        for (int row = 0; row < 3; ++row) {
+            for (int column = 0; column < 3; ++column) {
+                to_local_[row][column] = static_cast<float>(m[row][column]);
+            }
+        }
+    }
+
+    const Volume& volume() const { return *volume_; }
+    const Color& albedo() const { return albedo_; }
+    const HenyeyGreenstein& phase() const { return phase_; }
+    bool grey() const { return albedo_.x == albedo_.y && albedo_.y == albedo_.z; }
+
+    /// A ray from a local position along a unit vector of the world.
+    LocalRay ray(const V3f& local_position, const V3f& world_direction) const {
+        return {local_position, world_direction * to_local_};
+    }
+
+    /// Whether a local position lies in the box around everything stored. Not so for NaN and
+    /// infinities.
+    bool inside(const V3f& x) const {
+        const V3f low(tree_->low()), high(tree_->high());
+        return x.x >= low.x && x.y >= low.y && x.z >= low.z && x.x < high.x && x.y < high.y &&
+               x.z < high.z;
+    }
+
+    /// sigma_t at a local position inside the box: one interpolated voxel.
+    float extinction(const V3f& x) const { return extinction_ * tree_->interpolate(x); }
+
+    /// An unbiased estimate of sigma_t that reads a single voxel, never above the majorant.
+    float extinction_tap(const V3f& x, Random& random) const {
+        const std::uint64_t bits = random.bits();
+        const auto jitter = [bits](int shift) {
+            return static_cast<float>((bits >> shift) & 0x1fffff) * 0x1p-21f;
+        };
+        return extinction_ * tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42)));
+    }
+
+    /// The stretches of a ray that may hold anything. Their majorants are of the density: times
+    /// `scale()` they are of sigma_t.
+    MajorantIterator majorants(const LocalRay& ray) const { return {*tree_, ray}; }
+    float scale() const { return extinction_; }
+
+  private:
+    const Volume* volume_;
+    const BrickTree* tree_;
+    float extinction_;
+    Color albedo_;
+    HenyeyGreenstein phase_;
+    Imath::M33f to_local_;
+};
+
+}  // namespace pileus

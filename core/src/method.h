@@ -1,0 +1,36 @@
+// Transport methods: what one path of each does. A method is a page of code over the medium, the
+// marches and the tracking; a new one is a file under methods/ and a line in method.cpp.
+#pragma once
+
+#include "path.h"
+
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace pileus {
+
+/// One thread's instance of a method. Scene and transport outlive it.
+class Method {
+  public:
+    virtual ~Method() = default;
+
+    /// Follows the part of a camera ray that lies in the volume, and adds what it finds to the
+    /// record.
+    virtual void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) = 0;
+};
+
+/// The names a transport may have, in the order of DESIGN's table.
+std::vector<std::string> method_names();
+
+/// The transport with its method's own number of bounces where none was asked for. Throws
+/// InputError for a method, a number of bounces or a look that is out of range.
+Transport resolve(Transport transport);
+
+/// `transport` must be resolved.
+std::unique_ptr<Method> make_method(const Scene& scene, const Transport& transport);
+
+/// Events after which any path ends, and is counted: a bound on work, far beyond what light needs.
+constexpr int most_events = 1 << 20;
+
+}  // namespace pileus

@@ -1,0 +1,38 @@
+// `contrast`: the approximation of Wrenninge, Kulla & Lundqvist (2013): the first event gathers the
+// direct light of every order, as if the light had been scattered and spread on its way in. With
+// one octave it is `single`.
+#include "first_event.h"
+#include "methods.h"
+
+namespace pileus {
+
+namespace {
+
+class Contrast final : public Method {
+  public:
+    Contrast(const Scene& scene, const Transport& transport)
+        : scene_(scene),
+          octaves_(*transport.max_bounces),
+          light_(scene, transport.looks, Sky::shadow_rays) {}
+
+    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+        Random walk = random.stream(walk_stream);
+        if (const auto event = first_event(scene_, ray, random, walk, march_, record)) {
+            light_.add(*event, 0, octaves_, random, record);
+        }
+    }
+
+  private:
+    const Scene& scene_;
+    int octaves_;
+    DirectLight light_;
+    DensityMarch march_;
+};
+
+}  // namespace
+
+std::unique_ptr<Method> make_contrast(const Scene& scene, const Transport& transport) {
+    return std::make_unique<Contrast>(scene, transport);
+}
+
+}  // namespace pileus

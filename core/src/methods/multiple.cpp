@@ -1,0 +1,68 @@
+// `multiple`: Wrenninge's talk (SIGGRAPH 2015) to the letter. After a density-sampled first event
+// the light is followed by a random walk that reads one interpolated voxel and inverts the phase
+// function once a bounce: Woodcock tracking with the majorant approximated by the local extinction.
+//
+// The talk is silent where the local extinction d is 0. A step of -ln(1-u)/d then has no length,
+// and MoonRay's walk ends. Here a point without density is no scatter event: the walk keeps its
+// direction and goes on by exact delta tracking to its next event. Where d is tiny but not 0 the
+// walk leaps, to the letter; that is the method's bias. A step out of the volume that meets nothing
+// more ends the path.
+#include "../tracking.h"
+#include "first_event.h"
+#include "methods.h"
+
+#include <cmath>
+
+namespace pileus {
+
+namespace {
+
+class Multiple final : public Method {
+  public:
+    Multiple(const Scene& scene, const Transport& transport)
+        : scene_(scene),
+          orders_(*transport.max_bounces),
+          light_(scene, transport.looks, Sky::shadow_rays) {}
+
+    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+        const Medium& medium = scene_.medium;
+        Random walk = random.stream(walk_stream);
+        auto event = first_event(scene_, ray, random, walk, march_, record);
+        if (!event) return;
+        float local = medium.extinction(event->position);
+        for (int order = 0;; ++order) {
+            light_.add(*event, order, order + 1, random, record);
+            if (order + 1 == orders_) return;
+            const float u1 = walk.uniform(), u2 = walk.uniform();
+            event->direction = medium.phase().sample(event->direction, u1, u2);
+            LocalRay step = medium.ray(event->position, event->direction);
+            if (local > 0.0f) {
+                step.origin = step.at(walk.exponential() / local);
+                if (!medium.inside(step.origin)) return;
+                local = medium.extinction(step.origin);
+            }
+            if (local == 0.0f) {
+                const auto distance = delta_track(medium, step, walk.exponential(), walk);
+                if (!distance) return;
+                step.origin = step.at(*distance);
+                local = medium.extinction(step.origin);
+            }
+            event->position = step.origin;
+            event->weight *= medium.albedo();
+        }
+    }
+
+  private:
+    const Scene& scene_;
+    int orders_;
+    DirectLight light_;
+    DensityMarch march_;
+};
+
+}  // namespace
+
+std::unique_ptr<Method> make_multiple(const Scene& scene, const Transport& transport) {
+    return std::make_unique<Multiple>(scene, transport);
+}
+
+}  // namespace pileus

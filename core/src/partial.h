@@ -1,0 +1,42 @@
+// What a task renders: the pixels of one bucket over one contiguous range of samples, with all that
+// a merge needs to know of them.
+#pragma once
+
+#include "exr_file.h"
+
+#include <cstdint>
+#include <string>
+
+namespace pileus {
+
+/// The sample indices [first, last) of each pixel.
+struct SampleRange {
+    int first, last;
+    int count() const { return last - first; }
+    auto operator<=>(const SampleRange&) const = default;
+};
+
+/// The channels of partials and frames: R, G, B, A, Z, the variance of the pixel mean, then the
+/// orders.
+std::vector<std::string> channel_names(std::size_t orders);
+
+struct Partial {
+    enum Channel : std::size_t { r, g, b, a, z, variance_r, variance_g, variance_b, first_order };
+
+    int width = 0, height = 0;  // of the whole image
+    SampleRange samples{};
+    LayeredImage image;  // means over the samples; of one sample, the variance is told as 0
+    std::int64_t bounded_paths = 0;
+    std::string identity;  // of the frame it belongs to: partials of different ones never mix
+
+    /// Whole or not at all. The header carries a digest of everything. Throws std::runtime_error.
+    void write(const std::string& path) const;
+
+    /// Throws InputError for a file that is truncated, altered or no partial.
+    static Partial read(const std::string& path);
+
+    /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
+    void pool(const Partial& other);
+};
+
+}  // namespace pileus

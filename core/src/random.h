@@ -1,0 +1,113 @@
+// Random numbers that depend on a key alone: SplitMix64 streams (Steele, Lea & Flood 2014) and, for
+// a path's first dimensions, Sobol points with hash-based Owen scrambling (Burley 2020; Laine &
+// Karras 2011).
+#pragma once
+
+#include <array>
+#include <bit>
+#include <cmath>
+#include <cstdint>
+
+namespace pileus {
+
+/// The finaliser of SplitMix64: a bijection of 64-bit words with full avalanche.
+constexpr std::uint64_t mix64(std::uint64_t x) {
+    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
+    x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
+    return x ^ (x >> 31);
+}
+
+/// Folds one more word into a key.
+constexpr std::uint64_t hash_key(std::uint64_t key, std::uint64_t word) {
+    return mix64(key ^ (mix64(word + 0x9e3779b97f4a7c15ULL) + 0x9e3779b97f4a7c15ULL));
+}
+
+/// The 24 high bits of a word as a float in [0, 1).
+constexpr float unit_float(std::uint32_t bits) { return static_cast<float>(bits >> 8) * 0x1p-24f; }
+
+/// A stream of random numbers: the n-th is a function of (key, n).
+class Random {
+  public:
+    explicit constexpr Random(std::uint64_t key) : state_(key) {}
+
+    constexpr std::uint64_t bits() { return mix64(state_ += 0x9e3779b97f4a7c15ULL); }
+
+    /// Uniform in [0, 1).
+    constexpr float uniform() { return unit_float(static_cast<std::uint32_t>(bits() >> 32)); }
+
+    /// Exponentially distributed with mean 1; finite.
+    float exponential() { return -std::log(1.0f - uniform()); }
+
+  private:
+    std::uint64_t state_;
+};
+
+namespace sobol {
+
+constexpr int dimensions = 4;
+
+/// Direction numbers of the first four dimensions, from Joe & Kuo's primitive polynomials (2008).
+constexpr std::array<std::array<std::uint32_t, 32>, dimensions> direction_numbers() {
+    struct Polynomial {
+        unsigned degree, coefficients;
+        std::array<std::uint32_t, 3> initial;
+    };
+    constexpr std::array<Polynomial, 3> polynomials{
+        {{1, 0, {1, 0, 0}}, {2, 1, {1, 3, 0}}, {3, 1, {1, 3, 1}}}};
+    std::array<std::array<std::uint32_t, 32>, dimensions> v{};
+    for (unsigned i = 0; i < 32; ++i) v[0][i] = 1u << (31 - i);
+    for (unsigned d = 1; d < dimensions; ++d) {
+        const auto& [s, a, m] = polynomials[d - 1];
+        for (unsigned i = 0; i < 32; ++i) {
+            if (i < s) {
+                v[d][i] = m[i] << (31 - i);
+                continue;
+            }
+            v[d][i] = v[d][i - s] ^ (v[d][i - s] >> s);
+            for (unsigned k = 1; k < s; ++k) {
+                if ((a >> (s - 1 - k)) & 1u) v[d][i] ^= v[d][i - k];
+            }
+        }
+    }
+    return v;
+}
+
+constexpr std::uint32_t reverse_bits(std::uint32_t x) {
+    x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
+    x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
+    x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
+    x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
+    return (x >> 16) | (x << 16);
+}
+
+/// A nested uniform (Owen) scramble of x: each bit is flipped by a hash of the bits above it.
+constexpr std::uint32_t owen_scramble(std::uint32_t x, std::uint32_t seed) {
+    x = reverse_bits(x);
+    x ^= x * 0x3d20adeau;
+    x += seed;
+    x *= (seed >> 16) | 1u;
+    x ^= x * 0x05526c56u;
+    x ^= x * 0x53a22864u;
+    return reverse_bits(x);
+}
+
+/// Point `index` of the sequence that `key` names: four scrambled coordinates in [0, 1). Sequences
+/// with different keys are shuffled against each other, so that they may be padded into higher
+/// dimensions.
+inline std::array<float, dimensions> point(std::uint32_t index, std::uint64_t key) {
+    static constexpr auto directions = direction_numbers();
+    const std::uint32_t shuffled = owen_scramble(index, static_cast<std::uint32_t>(mix64(key)));
+    std::array<float, dimensions> result{};
+    for (unsigned d = 0; d < dimensions; ++d) {
+        std::uint32_t x = 0;
+        for (std::uint32_t rest = shuffled; rest != 0; rest &= rest - 1) {
+            x ^= directions[d][static_cast<unsigned>(std::countr_zero(rest))];
+        }
+        const auto seed = static_cast<std::uint32_t>(hash_key(key, d + 1) >> 32);
+        result[d] = unit_float(owen_scramble(x, seed));
+    }
+    return result;
+}
+
+}  // namespace sobol
+}  // namespace pileus

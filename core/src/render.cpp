@@ -1,0 +1,165 @@
+#include "render.h"
+
+#include "error.h"
+
+#include <tbb/blocked_range2d.h>
+#include <tbb/enumerable_thread_specific.h>
+#include <tbb/parallel_for.h>
+#include <tbb/task_arena.h>
+
+namespace pileus {
+
+namespace {
+
+/// Sums over one pixel's samples.
+class PixelSums {
+  public:
+    PixelSums(std::size_t looks, std::size_t orders, bool keep_orders)
+        : keep_orders_(keep_orders),
+          sum_(looks),
+          squares_(looks),
+          order_sums_(keep_orders ? looks * orders : 0) {}
+
+    void clear() {
+        std::fill(sum_.begin(), sum_.end(), V3d(0.0));
+        std::fill(squares_.begin(), squares_.end(), V3d(0.0));
+        std::fill(order_sums_.begin(), order_sums_.end(), V3d(0.0));
+        opacity_ = depth_ = 0.0;
+    }
+
+    void add(const PathRecord& record) {
+        for (std::size_t look = 0; look < sum_.size(); ++look) {
+            V3d radiance(record.sky);
+            for (std::size_t i = 0; i < record.orders(); ++i) {
+                const V3d layer(record.radiance(look, i));
+                radiance += layer;
+                if (keep_orders_) order_sums_[look * record.orders() + i] += layer;
+            }
+            sum_[look] += radiance;
+            squares_[look] += radiance * radiance;
+        }
+        opacity_ += record.opacity;
+        depth_ += record.opacity * record.depth;
+    }
+
+    void store(LayeredImage& image, std::size_t pixel, int count) const {
+        const double n = count;
+        for (std::size_t look = 0; look < sum_.size(); ++look) {
+            const auto set = [&](std::size_t channel, double value) {
+                image.plane(look, channel)[pixel] = static_cast<float>(value);
+            };
+            for (int c = 0; c < 3; ++c) {
+                const auto channel = static_cast<std::size_t>(c);
+                const double mean = sum_[look][c] / n;
+                set(Partial::r + channel, mean);
+                const double spread = std::max(0.0, squares_[look][c] - mean * sum_[look][c]);
+                set(Partial::variance_r + channel, count > 1 ? spread / (n * (n - 1.0)) : 0.0);
+            }
+            set(Partial::a, opacity_ / n);
+            set(Partial::z, opacity_ > 0.0 ? depth_ / opacity_ : 0.0);
+            const std::size_t orders = order_sums_.size() / sum_.size();
+            for (std::size_t i = 0; i < orders; ++i) {
+                for (int c = 0; c < 3; ++c) {
+                    set(Partial::first_order + 3 * i + static_cast<std::size_t>(c),
+                        order_sums_[look * orders + i][c] / n);
+                }
+            }
+        }
+    }
+
+  private:
+    bool keep_orders_;
+    std::vector<V3d> sum_, squares_, order_sums_;
+    double opacity_ = 0.0, depth_ = 0.0;
+};
+
+/// One thread's instance of all that changes along a path.
+struct Workspace {
+    Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
+        : method(make_method(scene, transport)),
+          record(transport.looks.size(), orders),
+          sums(transport.looks.size(), orders, keep_orders) {}
+    std::unique_ptr<Method> method;
+    PathRecord record;
+    PixelSums sums;
+};
+
+void trace_sample(const Scene& scene, int x, int y, const PathRandom& random, Method& method,
+                  PathRecord& record) {
+    record.clear();
+    const CameraRay ray =
+        scene.camera_ray(x + double{random.first[0]}, y + double{random.first[1]});
+    if (ray.volume) method.trace(ray, random, record);
+    if (scene.background && record.opacity < 1.0f)
+        record.sky = scene.sky(ray.direction) * (1.0f - record.opacity);
+}
+
+void check(const Scene& scene, const Transport& transport, const RenderTask& task) {
+    const Bucket& b = task.bucket;
+    if (b.x0 < 0 || b.y0 < 0 || b.x1 > scene.width || b.y1 > scene.height || b.width() < 1 ||
+        b.height() < 1) {
+        throw InputError("the bucket is empty or lies outside the image");
+    }
+    if (task.samples.first < 0 || task.samples.count() < 1)
+        throw InputError("the sample range is empty");
+    if (task.orders && !transport.max_bounces) {
+        throw InputError(
+            "image.orders needs a bounded number of orders; set transport.max_bounces");
+    }
+}
+
+}  // namespace
+
+Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
+               Control& control) {
+    check(scene, transport, task);
+    const std::size_t orders = task.orders ? static_cast<std::size_t>(*transport.max_bounces) : 1;
+    std::vector<std::string> looks;
+    for (const Look& look : transport.looks) looks.push_back(look.name);
+
+    Partial partial;
+    partial.width = scene.width;
+    partial.height = scene.height;
+    partial.samples = task.samples;
+    partial.image = LayeredImage(task.bucket, looks, channel_names(task.orders ? orders : 0));
+
+    const std::uint64_t frame_key =
+        hash_key(hash_key(0, task.seed), static_cast<std::uint64_t>(task.frame));
+    std::atomic<std::int64_t> bounded{0};
+    tbb::enumerable_thread_specific<Workspace> workspaces(
+        [&] { return Workspace(scene, transport, orders, task.orders); });
+
+    const auto render_pixel = [&](int x, int y) {
+        auto& [method, record, sums] = workspaces.local();
+        const std::uint64_t pixel_key = hash_key(hash_key(frame_key, static_cast<std::uint64_t>(y)),
+                                                 static_cast<std::uint64_t>(x));
+        sums.clear();
+        for (int sample = task.samples.first; sample < task.samples.last; ++sample) {
+            if (control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
+            const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample));
+            trace_sample(scene, x, y, random, *method, record);
+            if (record.bounded) bounded.fetch_add(1, std::memory_order_relaxed);
+            sums.add(record);
+        }
+        const auto pixel = static_cast<std::size_t>(y - task.bucket.y0) *
+                               static_cast<std::size_t>(task.bucket.width()) +
+                           static_cast<std::size_t>(x - task.bucket.x0);
+        sums.store(partial.image, pixel, task.samples.count());
+        control.samples_done.fetch_add(task.samples.count(), std::memory_order_relaxed);
+    };
+
+    using Tiles = tbb::blocked_range2d<int>;
+    tbb::task_arena arena(threads > 0 ? threads : tbb::task_arena::automatic);
+    arena.execute([&] {
+        const Tiles tiles(task.bucket.y0, task.bucket.y1, 4, task.bucket.x0, task.bucket.x1, 4);
+        tbb::parallel_for(tiles, [&](const Tiles& tile) {
+            for (int y = tile.rows().begin(); y != tile.rows().end(); ++y) {
+                for (int x = tile.cols().begin(); x != tile.cols().end(); ++x) render_pixel(x, y);
+            }
+        });
+    });
+    partial.bounded_paths = bounded;
+    return partial;
+}
+
+}  // namespace pileus

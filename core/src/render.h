@@ -1,0 +1,37 @@
+// The render loop: the samples of a bucket's pixels, over all threads.
+#pragma once
+
+#include "method.h"
+#include "partial.h"
+
+#include <atomic>
+#include <cstdint>
+
+namespace pileus {
+
+/// What a caller in another thread sees of a render, and how it ends it.
+struct Control {
+    std::atomic<std::int64_t> samples_done{0};  // pixel samples
+    std::atomic<bool> cancelled{false};
+};
+
+/// Thrown by a render that was cancelled.
+struct Cancelled : std::runtime_error {
+    Cancelled() : std::runtime_error("cancelled") {}
+};
+
+struct RenderTask {
+    Bucket bucket;
+    SampleRange samples;
+    std::uint64_t seed;
+    int frame;
+    bool orders;  // whether to keep each order's image; needs a bounded number of them
+};
+
+/// Renders a task with `threads` threads (0: all there are). Each pixel's samples depend on (seed,
+/// frame, pixel, sample index) alone. Throws InputError for a task that does not fit the scene,
+/// Cancelled.
+Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
+               Control& control);
+
+}  // namespace pileus
