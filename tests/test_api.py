@@ -1,0 +1,205 @@
+"""The HTTP API over a real Redis, with the tests as its workers: answers, refusals, trust."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+from redis import Redis
+
+from pileus_service.app import create_app
+from pileus_service.auth import Guard, guard_for
+from pileus_service.farm import Farm
+from pileus_service.jobs import Merged, Planned, WorkerInfo
+from pileus_service.queue import Queue
+from pileus_service.roots import Roots
+from pileus_service.store import Store
+
+LOCAL = "http://127.0.0.1"
+WORKER = WorkerInfo(name="W", host="host", pid=1, threads=1, started=0.0)
+
+
+@pytest.fixture
+def farm(redis: Redis, tmp_path: Path, shot: dict[str, Any]) -> Farm:
+    (tmp_path / "caches").mkdir()
+    for frame in (1, 2, 3):
+        (tmp_path / "caches" / f"cloud.{frame:04d}.vdb").touch()
+    return Farm(Store(tmp_path / "data"), Queue(redis), Roots([tmp_path]))
+
+
+@pytest.fixture
+def client(farm: Farm) -> Iterator[TestClient]:
+    with TestClient(create_app(farm, Guard(None)), base_url=LOCAL) as client:
+        yield client
+
+
+def submit(client: TestClient, shot: dict[str, Any], **more: Any) -> str:
+    answer = client.post("/v1/jobs", json={"shot": shot, **more})
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["job"]["id"])
+
+
+def problem(answer: Any, status: int) -> str:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status
+    assert body.keys() == {"type", "title", "status", "detail", "errors"}
+    return str(body["detail"])
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + 10
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_job_is_taken_shown_steered_and_removed(client: TestClient, shot: dict[str, Any]) -> None:
+    job = submit(client, shot, priority=7)
+    seen = client.get(f"/v1/jobs/{job}").json()
+    assert (seen["state"], seen["priority"], seen["frames"]) == ("queued", 7, 3)
+    frames = client.get(f"/v1/jobs/{job}/frames", params={"offset": 1}).json()
+    assert [frame["frame"] for frame in frames] == [2, 3]
+    assert client.patch(f"/v1/jobs/{job}", json={"priority": 2}).json()["priority"] == 2
+    assert client.post(f"/v1/jobs/{job}/pause").json()["state"] == "paused"
+    assert client.post(f"/v1/jobs/{job}/resume").json()["state"] == "queued"
+    assert client.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"/v1/jobs/{job}/resume").json()["state"] == "cancelled"
+    assert [each["id"] for each in client.get("/v1/jobs").json()] == [job]
+    assert client.delete(f"/v1/jobs/{job}").status_code == 204
+    problem(client.get(f"/v1/jobs/{job}"), 404)
+
+
+def test_an_idempotency_key_makes_one_job_of_many_submissions(
+    client: TestClient, shot: dict[str, Any]
+) -> None:
+    def post(body: dict[str, Any]) -> Any:
+        return client.post("/v1/jobs", json={"shot": body}, headers={"Idempotency-Key": "k1"})
+
+    first, second = post(shot), post(shot)
+    assert (first.status_code, second.status_code) == (201, 200)
+    assert first.json()["job"]["id"] == second.json()["job"]["id"]
+    assert "Idempotency-Key" in problem(post({**shot, "name": "other"}), 409)
+
+
+def test_wrong_input_is_a_problem_that_points_at_the_field(
+    client: TestClient, shot: dict[str, Any], tmp_path: Path
+) -> None:
+    wrong = {**shot, "sampling": {"samples": 0}}
+    assert "samples" in problem(client.post("/v1/jobs", json={"shot": wrong}), 422)
+    problem(
+        client.post("/v1/jobs", content=b"{", headers={"content-type": "application/json"}), 422
+    )
+    problem(client.post("/v1/jobs", content=b" " * (2 << 20)), 413)
+    problem(client.get("/v1/jobs/UPPER"), 422)
+    problem(client.get("/v1/jobs/nobody"), 404)
+    problem(client.get("/v1/jobs", params={"limit": 100_000}), 422)
+    problem(client.get("/nowhere"), 404)
+    problem(client.put("/v1/jobs"), 405)
+    (tmp_path / "caches" / "cloud.0002.vdb").unlink()
+    assert "gap" in problem(client.post("/v1/jobs", json={"shot": shot}), 422)
+
+
+def test_paths_outside_the_roots_are_refused_links_followed(
+    client: TestClient,
+    shot: dict[str, Any],
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    outside = tmp_path_factory.mktemp("outside")
+    (outside / "a.vdb").touch()
+    (tmp_path / "link").symlink_to(outside)
+    (tmp_path / "file.vdb").symlink_to(outside / "a.vdb")
+    for cache in ("/etc/passwd", "link/a.vdb", "file.vdb", "../../a.vdb", f"{outside}/a.vdb"):
+        bad = {**shot, "volumes": [{"cache": cache, "extinction": 1.0}]}
+        assert "outside the roots" in problem(client.post("/v1/jobs", json={"shot": bad}), 422)
+    output = {**shot["image"], "output": "link/a.####.exr"}
+    bad = {**shot, "image": output}
+    assert "image.output" in problem(client.post("/v1/jobs", json={"shot": bad}), 422)
+
+
+def test_only_the_loopback_goes_without_a_token(farm: Farm, tmp_path: Path) -> None:
+    guard, token = guard_for("0.0.0.0", tmp_path)
+    assert token
+    assert token not in (tmp_path / "token.sha256").read_text()
+    again, none = guard_for("0.0.0.0", tmp_path)
+    assert none is None
+    for app in (create_app(farm, guard), create_app(farm, again)):
+        client = TestClient(app, base_url="http://farm.example")
+        problem(client.get("/v1/jobs"), 401)
+        problem(client.get("/metrics", headers={"Authorization": "Bearer wrong"}), 401)
+        assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).is_success
+    rebound = TestClient(create_app(farm, Guard(None)), base_url="http://evil.example")
+    problem(rebound.get("/v1/jobs"), 403)
+
+
+def test_health_metrics_and_the_api_page(client: TestClient, shot: dict[str, Any]) -> None:
+    submit(client, shot, priority=3)
+    assert client.get("/healthz").json()["status"] == "ok"
+    assert client.get("/readyz").is_success
+    assert 'pileus_tasks_waiting{priority="3"} 2.0' in client.get("/metrics").text
+    assert client.get("/docs").is_success
+    paths = client.get("/openapi.json").json()["paths"]
+    assert "/v1/jobs/{job_id}/frames/{frame}/preview.png" in paths
+
+
+def test_events_tell_each_change_until_the_end(
+    client: TestClient, farm: Farm, shot: dict[str, Any]
+) -> None:
+    job = submit(client, {**shot, "frames": "1"})
+    states = []
+    with client.stream("GET", f"/v1/jobs/{job}/events") as answer:
+        for line in answer.iter_lines():
+            if line.startswith("data:"):
+                states.append(json.loads(line[5:])["state"])
+                if len(states) == 1:
+                    work(farm.queue)
+    assert states[0] == "queued"
+    assert states[-1] == "done"
+
+
+def work(queue: Queue) -> None:
+    """Does all tasks there are as a worker would, without rendering."""
+    while task := queue.claim(WORKER):
+        planned = Planned(tasks=0, finished=[], total=0, samples=0)
+        queue.complete(task, "W", planned if task.kind == "plan" else Merged())
+
+
+def test_a_redis_that_was_emptied_is_filled_again_from_disk(
+    client: TestClient, farm: Farm, shot: dict[str, Any], redis: Redis
+) -> None:
+    done = submit(client, {**shot, "frames": "1"})
+    work(farm.queue)
+    paused = submit(client, shot, priority=8)
+    cancelled = submit(client, shot)
+    client.post(f"/v1/jobs/{paused}/pause")
+    client.post(f"/v1/jobs/{cancelled}/cancel")
+    wait_for(lambda: farm.store.wished(done).state == "done")
+    redis.flushall()
+    wait_for(lambda: len(farm.queue.job_ids()) == 3)
+    states = {each["id"]: each["state"] for each in client.get("/v1/jobs").json()}
+    assert states == {done: "done", paused: "paused", cancelled: "cancelled"}
+    assert client.get(f"/v1/jobs/{paused}").json()["priority"] == 8
+
+
+def test_a_change_that_redis_forgot_is_made_again(
+    client: TestClient, farm: Farm, shot: dict[str, Any]
+) -> None:
+    job = submit(client, shot)
+    client.post(f"/v1/jobs/{job}/pause")
+    farm.queue.control(job, "resume")  # as after a restart that lost the last second
+    wait_for(lambda: farm.queue.state(job) == "paused")
+
+
+def test_no_redis_is_a_problem_not_a_stack_trace(farm: Farm, shot: dict[str, Any]) -> None:
+    dead = Redis.from_url("unix:///nowhere/redis", decode_responses=True)
+    app: FastAPI = create_app(Farm(farm.store, Queue(dead), farm.roots), Guard(None))
+    client = TestClient(app, base_url=LOCAL)
+    assert "Redis" in problem(client.get("/v1/jobs"), 503)
+    problem(client.get("/readyz"), 503)
+    assert client.get("/healthz").is_success

@@ -1,0 +1,34 @@
+"""The house's rules that a reviewer would otherwise have to keep in mind."""
+
+import subprocess
+import sys
+
+
+def test_the_service_needs_neither_worker_nor_core() -> None:
+    """A service host has no compiler: nothing in the service may need what it would build."""
+    program = """
+import importlib, pkgutil, sys
+class Barred:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("pileus_worker", "pileus_core", "numpy", "PIL"):
+            raise ImportError(f"{name} is barred")
+sys.meta_path.insert(0, Barred())
+import pileus_service
+for module in pkgutil.walk_packages(pileus_service.__path__, "pileus_service."):
+    importlib.import_module(module.name)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_without_the_renderer_the_program_says_what_to_install() -> None:
+    program = """
+import sys
+sys.modules["pileus_core"] = None
+sys.argv = ["pileus", "render", "shot.toml"]
+from pileus_service.cli import main
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert "pip install" in ended.stderr
+    assert "Traceback" not in ended.stderr
