@@ -17,9 +17,10 @@ from typer.main import get_command
 from pileus_service import __version__
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
-from pileus_service.jobs import FrameView, JobState, JobView, Record
-from pileus_service.progress import Display, Row, duration
+from pileus_service.jobs import JobState, Record
+from pileus_service.progress import duration
 from pileus_service.shotfile import load_shot
+from pileus_service.watching import describe, wait_for
 
 Server = Annotated[
     str, typer.Option(envvar="PILEUS_SERVER", help="The service's address.", metavar="URL")
@@ -105,7 +106,7 @@ def submit(
             print(f"{shot}: warning: {warning}", file=sys.stderr)
         job = accepted.job
         if wait:
-            job = _wait(client, job)
+            job = wait_for(client, job)
         elif not as_json:
             print(job.id)
     if as_json:
@@ -144,7 +145,7 @@ def status(
         told["frames_list"] = [frame.model_dump(mode="json") for frame in frames]
         print(json.dumps(told))
         return
-    print(f"{view.id} {view.name}: {view.state}, {_describe(view)}")
+    print(f"{view.id} {view.name}: {view.state}, {describe(view)}")
     table = _table("frame", "state", "done", "seconds", "")
     for frame in frames:
         seconds = f"{frame.seconds:.1f}" if frame.seconds is not None else ""
@@ -205,33 +206,6 @@ def service(
     from pileus_service.server import serve  # a client need not load it
 
     serve(data, redis, root or [Path.cwd()], listen)
-
-
-def _wait(client: Client, job: JobView) -> JobView:
-    with Display() as display:
-        for view in client.watch(job.id):
-            job = view
-            whole = Row(job.name, job.progress, _describe(job))
-            display.show(whole, *map(_frame_row, job.active))
-        display.note(f"{job.name}: {job.state}, {_describe(job)}")
-    return job
-
-
-def _frame_row(frame: FrameView) -> Row:
-    tasks = f"{frame.tasks_done} of {frame.tasks} tasks" if frame.tasks else ""
-    return Row(f"  frame {frame.frame}", frame.progress, f"{frame.state} {tasks}")
-
-
-def _describe(job: JobView) -> str:
-    text = f"{job.frames_done} of {job.frames} frames"
-    if job.frames_failed:
-        text += f", {job.frames_failed} failed"
-    text += f", {job.samples / 1e6:.1f} M samples"
-    if job.seconds_left is not None:
-        text += f", {duration(job.seconds_left)} left"
-    elif job.finished and job.started:
-        text += f", took {duration(job.finished - job.started)}"
-    return text
 
 
 def _table(*columns: str) -> Table:

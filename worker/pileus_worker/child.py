@@ -25,6 +25,7 @@ class Setup:
     roots: tuple[Path, ...]
     threads: int
     cache_bytes: int
+    task_seconds: float
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def run(pipe: "Connection[Any, Any]", setup: Setup) -> None:
                 roots,
                 caches,
                 setup.threads,
+                setup.task_seconds,
                 order.job,
                 order.frame,
                 order.kind,

@@ -14,6 +14,7 @@ from typing import IO
 from pileus_service.errors import FarmError, InputError
 from pileus_service.server import bind, make_server
 from pileus_worker import machine
+from pileus_worker.commands.worker import TASK_SECONDS
 from pileus_worker.lifeline import die_with_parent
 from pileus_worker.private_redis import PrivateRedis
 
@@ -75,7 +76,9 @@ class EmbeddedFarm:
 
 
 @contextlib.contextmanager
-def embedded_farm(data: Path, roots: list[Path], count: int, listen: str) -> Iterator[EmbeddedFarm]:
+def embedded_farm(
+    data: Path, roots: list[Path], count: int, listen: str, task_seconds: float = TASK_SECONDS
+) -> Iterator[EmbeddedFarm]:
     """Runs a farm while the block runs; whatever ends the block ends all of it, in order."""
     data = data.resolve()
     data.mkdir(parents=True, exist_ok=True)
@@ -86,7 +89,7 @@ def embedded_farm(data: Path, roots: list[Path], count: int, listen: str) -> Ite
         (data / "workers.log").open("ab") as log,
     ):
         server = make_server(data, redis.url, roots, listen)
-        workers = Workers(_command(data, redis.url, roots, count), count, log)
+        workers = Workers(_command(data, redis.url, roots, count, task_seconds), count, log)
         threads = [
             threading.Thread(target=server.run, args=([listener],), name="service"),
             threading.Thread(target=workers.keep_up, name="workers"),
@@ -108,11 +111,13 @@ def embedded_farm(data: Path, roots: list[Path], count: int, listen: str) -> Ite
                 thread.join()
 
 
-def _command(data: Path, redis_url: str, roots: list[Path], count: int) -> list[str]:
+def _command(
+    data: Path, redis_url: str, roots: list[Path], count: int, task_seconds: float
+) -> list[str]:
     threads = max(1, machine.cores() // count)
     memory = machine.memory_bytes() / count / (1 << 30)
     command = [sys.executable, "-m", "pileus_worker", "--data", str(data), "--redis", redis_url]
-    command += [f"--threads={threads}", f"--memory={memory:.3f}"]
+    command += [f"--threads={threads}", f"--memory={memory:.3f}", f"--task-seconds={task_seconds}"]
     return [*command, *(f"--root={root}" for root in roots)]
 
 

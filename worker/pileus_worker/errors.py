@@ -14,8 +14,13 @@ def plain_errors(source: str) -> Iterator[None]:
     try:
         yield
     except core.InputError as error:
-        raise InputError(f"{source}: {error}") from None
+        raise InputError(_named(source, error)) from None
+    except FarmError:
+        raise
     except (OSError, RuntimeError) as error:
-        if isinstance(error, FarmError):
-            raise
-        raise FarmError(f"{source}: {error}") from None
+        raise FarmError(_named(source, error)) from None
+
+
+def _named(source: str, error: Exception) -> str:
+    line = str(error)
+    return line if line.startswith(source) else f"{source}: {line}"

@@ -8,8 +8,6 @@ import pileus_core as core
 
 from pileus_service.jobs import Bucket, Part
 
-# Long enough to hide the cost of a task, short enough to lose little with a worker.
-TASK_SECONDS = 4.0
 SMALLEST = 32
 LARGEST = 512
 MAX_TASKS = 50_000
@@ -73,21 +71,21 @@ def measure(
 
 
 def cut(
-    scene: core.Scene, cost: Cost, size: tuple[int, int], samples: int
+    scene: core.Scene, cost: Cost, size: tuple[int, int], samples: int, seconds: float
 ) -> tuple[list[Part], list[Bucket]]:
-    """Parts of about TASK_SECONDS each, and the buckets that no ray of meets the volume."""
+    """Parts of about so many seconds each, and the buckets that no ray of meets the volume."""
     width, height = size
     edge = LARGEST
     while True:
         buckets = tiles(width, height, edge)
         dearest = max(_seconds(bucket, cost) for bucket in buckets) * samples
         # Ranges of at least a few samples: below, the cost of a task is no longer hidden.
-        if edge == SMALLEST or dearest / TASK_SECONDS <= max(1, samples // 16):
+        if edge == SMALLEST or dearest / seconds <= max(1, samples // 16):
             break
         edge //= 2
     touched = [bucket for bucket in buckets if scene.touches(bucket)]
     total = sum(_seconds(bucket, cost) for bucket in touched) * samples
-    task = max(TASK_SECONDS, total / MAX_TASKS)
+    task = max(seconds, total / MAX_TASKS)
     parts = []
     for bucket in touched:
         count = min(samples, max(1, round(_seconds(bucket, cost) * samples / task)))

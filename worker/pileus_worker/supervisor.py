@@ -35,11 +35,12 @@ GRACE = 1.0
 
 @dataclass
 class Limits:
-    """What a child may use."""
+    """What a child may use, and how long the tasks that it plans are to be."""
 
     threads: int
     cache_bytes: int
     memory_bytes: int
+    task_seconds: float
 
 
 class ChildLostError(Exception):
@@ -118,7 +119,9 @@ class Supervisor:
         self._queue = queue
         self._store = store
         self._limits = limits
-        self._setup = child.Setup(store.root, roots, limits.threads, limits.cache_bytes)
+        self._setup = child.Setup(
+            store.root, roots, limits.threads, limits.cache_bytes, limits.task_seconds
+        )
         host = socket.gethostname()
         self.info = WorkerInfo(
             name=f"{host}-{os.getpid()}-{secrets.token_hex(2)}",

@@ -35,6 +35,7 @@ class Work:
     roots: Roots
     caches: Caches
     threads: int
+    task_seconds: float
     job: Job
     frame: int
     kind: Kind
@@ -84,7 +85,7 @@ class Work:
             threads=self.threads,
             control=self.control,
         )
-        parts, empty = planning.cut(view, cost, size, shot.sampling.samples)
+        parts, empty = planning.cut(view, cost, size, shot.sampling.samples, self.task_seconds)
         return Plan(
             frame=self.frame,
             identity=identity,

@@ -16,7 +16,9 @@ from pileus_service.progress import Display, Row, duration
 from pileus_worker import machine
 from pileus_worker.errors import plain_errors
 
-app = typer.Typer(help="Makes procedural animated VDB caches, with velocity.", no_args_is_help=True)
+app = typer.Typer(
+    name="make", help="Makes procedural animated VDB caches, with velocity.", no_args_is_help=True
+)
 
 Subject = Literal["cloud", "whitewater"]
 Frames = Annotated[str, typer.Option(help='The frames, as "1-24".')]

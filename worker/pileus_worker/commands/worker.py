@@ -17,6 +17,9 @@ from pileus_worker.supervisor import Limits, Supervisor
 
 app = typer.Typer()
 
+# Long enough to hide what a task costs besides, short enough to lose little with a worker.
+TASK_SECONDS = 4.0
+
 
 @app.command("worker")
 def worker(
@@ -33,6 +36,9 @@ def worker(
     memory: Annotated[
         float, typer.Option(min=0, help="GiB that rendering may take; 0: most of the machine.")
     ] = 0.0,
+    task_seconds: Annotated[
+        float, typer.Option(min=0.01, max=600, help="How long a task is planned to take.")
+    ] = TASK_SECONDS,
 ) -> None:
     """Runs one worker: takes tasks from Redis until it gets SIGTERM or Ctrl-C."""
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
@@ -40,7 +46,7 @@ def worker(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     allowed = int(memory * (1 << 30)) or machine.memory_bytes()
-    limits = Limits(threads or machine.cores(), machine.cache_bytes(allowed), allowed)
+    limits = Limits(threads or machine.cores(), machine.cache_bytes(allowed), allowed, task_seconds)
     try:
         queue = Queue(connect(redis))
     except ValueError as error:

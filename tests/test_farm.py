@@ -1,0 +1,248 @@
+"""The whole farm on this machine: its images, its losses, its end."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+import pytest
+from redis import Redis
+
+from pileus_service.client import Client
+from pileus_service.jobs import JobView, Plan
+from pileus_service.shot import Shot
+from pileus_service.store import Store
+from pileus_worker import scene
+from pileus_worker.embedded import EmbeddedFarm, embedded_farm
+
+PILEUS = Path(sys.executable).with_name("pileus")
+
+
+@pytest.fixture(scope="session")
+def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("caches")
+    for frame in (1, 2, 3):
+        core.make_cloud(
+            str(folder / f"cloud.{frame:04d}.vdb"), frame=frame, frames=3, resolution=48
+        )
+    return folder
+
+
+@pytest.fixture
+def real_shot(shot: dict[str, Any], caches: Path) -> Shot:
+    """Small, and yet several buckets and sample ranges a frame where tasks are planned short."""
+    shot["volumes"][0]["cache"] = str(caches / "cloud.####.vdb")
+    shot["image"] |= {"width": 96, "height": 64}
+    shot["sampling"]["samples"] = 48
+    return Shot.model_validate(shot)
+
+
+@pytest.fixture
+def farm(tmp_path: Path, caches: Path) -> Iterator[EmbeddedFarm]:
+    with embedded_farm(tmp_path / "farm", [tmp_path, caches], 2, "127.0.0.1:0", 0.05) as farm:
+        yield farm
+
+
+@pytest.fixture
+def client(farm: EmbeddedFarm) -> Iterator[Client]:
+    with Client(farm.url) as client:
+        yield client
+
+
+def finish(client: Client, job: str) -> JobView:
+    end = time.monotonic() + 120
+    for view in client.watch(job):
+        assert time.monotonic() < end, view
+    assert view.state == "done", view.reason
+    return view
+
+
+def plan_of(tmp_path: Path, job: str, frame: int) -> Plan:
+    plan = Store(tmp_path / "farm").frame(job, frame).plan()
+    assert plan is not None
+    return plan
+
+
+def rendered_here(shot: Shot, plan: Plan) -> core.Frame:
+    """What a farm must write, bit for bit: the plan's parts, rendered one by one."""
+    volume = core.Volume(plan.cache.path, shot.volumes[0].density)
+    view, transport = scene.make_scene(shot, plan.frame, volume), scene.make_transport(shot)
+    samples = shot.sampling.samples
+    buckets = [*dict.fromkeys(part.bucket for part in plan.parts), *plan.empty]
+    size = (shot.image.width, shot.image.height)
+    frame = core.Frame(*size, [(bucket, samples) for bucket in buckets])
+    parts = [(part.bucket, part.samples) for part in plan.parts]
+    parts += [(bucket, (0, samples)) for bucket in plan.empty]
+    for bucket, span in parts:
+        frame.add(
+            core.render(
+                view,
+                transport,
+                bucket=bucket,
+                samples=span,
+                seed=shot.sampling.seed,
+                frame=plan.frame,
+            )
+        )
+    return frame
+
+
+def pixels(path: Path) -> dict[str, np.ndarray[Any, np.dtype[np.float32]]]:
+    [channels] = core.read_image(str(path)).values()
+    return dict(channels)
+
+
+def same_bits(shot: Shot, tmp_path: Path, job: str, frame: int) -> None:
+    here = rendered_here(shot, plan_of(tmp_path, job, frame))
+    expected = tmp_path / f"expected.{frame}.exr"
+    here.write(str(expected), header={})
+    for name, values in pixels(expected).items():
+        np.testing.assert_array_equal(pixels(shot.output(frame))[name], values, name)
+
+
+def test_the_farms_frames_equal_those_of_pileus_render(
+    client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    job = client.submit(real_shot).job.id
+    view = finish(client, job)
+    assert view.frames_done == 3
+    assert len({part.bucket for part in plan_of(tmp_path, job, 2).parts}) > 1
+    assert any(part.samples[0] > 0 for part in plan_of(tmp_path, job, 2).parts)
+    file = tmp_path / "shot.json"
+    file.write_text(real_shot.model_dump_json())
+    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
+    ended = subprocess.run(command, check=True, capture_output=True, text=True)
+    reports = json.loads(ended.stdout)["frames"]
+    assert [report["frame"] for report in reports] == [1, 2, 3]
+    for report in reports:
+        same_bits(real_shot, tmp_path, job, report["frame"])
+        farm = pixels(real_shot.output(report["frame"]))
+        for name, values in pixels(Path(report["file"])).items():
+            np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+    assert [frame.state for frame in client.frames(job)] == ["done"] * 3
+    preview = Store(tmp_path / "farm").frame(job, 1).preview
+    assert preview.read_bytes().startswith(b"\x89PNG")
+
+
+def test_killed_workers_change_no_bit(
+    farm: EmbeddedFarm, client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    job = client.submit(real_shot).job.id
+    killed = 0
+    for view in client.watch(job):
+        if killed < 2 and view.tasks > 2 * killed:
+            victims = [worker for worker in client.workers() if worker.alive and worker.task]
+            if victims:
+                os.kill(victims[0].pid, signal.SIGKILL)
+                killed += 1
+    assert (view.state, killed) == ("done", 2)
+    for frame in (1, 2, 3):
+        same_bits(real_shot, tmp_path, job, frame)
+
+
+def test_an_emptied_redis_loses_nothing_and_renders_nothing_twice(
+    farm: EmbeddedFarm, client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    job = client.submit(real_shot).job.id
+    parts = tmp_path / "farm" / "jobs" / job / "frames"
+    end = time.monotonic() + 60
+    while not list(parts.glob("000001/parts/*.exr")):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    client.control(job, "pause")
+    time.sleep(1.5)
+    before = {path: path.stat().st_mtime_ns for path in parts.glob("*/parts/*.exr")}
+    with Redis.from_url(farm.redis_url) as redis:
+        redis.flushall()
+    kept = dict.fromkeys(before, False)
+    client.control(job, "resume")
+    for _ in client.watch(job):
+        for path, written in before.items():
+            if path.exists():
+                assert path.stat().st_mtime_ns == written
+                kept[path] = True
+    assert client.job(job).state == "done"
+    assert any(kept.values())
+    for frame in (1, 2, 3):
+        same_bits(real_shot, tmp_path, job, frame)
+
+
+def test_a_damaged_partial_is_rendered_again(
+    client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    job = client.submit(real_shot.model_copy(update={"frames": "1"})).job.id
+    parts = tmp_path / "farm" / "jobs" / job / "frames" / "000001" / "parts"
+    end = time.monotonic() + 60
+    while not (files := list(parts.glob("*.exr"))):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    client.control(job, "pause")
+    data = bytearray(files[0].read_bytes())
+    data[len(data) // 2] ^= 0x10
+    files[0].write_bytes(data)
+    client.control(job, "resume")
+    finish(client, job)
+    same_bits(real_shot, tmp_path, job, 1)
+
+
+def test_a_cancelled_render_stops_within_two_seconds(client: Client, real_shot: Shot) -> None:
+    endless = real_shot.model_copy(
+        update={"sampling": real_shot.sampling.model_copy(update={"samples": 1 << 18})}
+    )
+    job = client.submit(endless).job.id
+    end = time.monotonic() + 30
+    while not any(worker.task and worker.task.kind == "render" for worker in client.workers()):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    begun = time.monotonic()
+    client.control(job, "cancel")
+    while any(worker.task for worker in client.workers()):
+        assert time.monotonic() - begun < 2.0
+        time.sleep(0.05)
+
+
+def test_a_frame_that_cannot_be_rendered_fails_alone_with_the_reason(
+    client: Client, real_shot: Shot, tmp_path: Path, caches: Path
+) -> None:
+    own = tmp_path / "own"
+    shutil.copytree(caches, own)
+    (own / "cloud.0002.vdb").write_bytes(b"no vdb")
+    volume = real_shot.volumes[0].model_copy(update={"cache": str(own / "cloud.####.vdb")})
+    job = client.submit(real_shot.model_copy(update={"volumes": (volume,)})).job.id
+    *_, view = client.watch(job)
+    assert (view.state, view.frames_done, view.frames_failed) == ("failed", 2, 1)
+    frames = {frame.frame: frame for frame in client.frames(job)}
+    assert frames[2].state == "failed"
+    assert "cloud.0002.vdb" in (frames[2].reason or "")
+
+
+def test_the_embedded_farm_ends_cleanly_on_ctrl_c(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [PILEUS, "up", "--workers", "2", "--listen", "127.0.0.1:0", "--data", tmp_path / "farm"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert "The farm is up" in process.stdout.readline()
+    children = _descendants(process.pid)
+    assert len(children) >= 3
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+
+
+def _descendants(pid: int) -> list[int]:
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [each for child in children for each in (int(child), *_descendants(int(child)))]
