@@ -31,9 +31,9 @@ class MajorantIterator {
         float enter = 0.0f, leave = std::numeric_limits<float>::infinity();
         for (int axis = 0; axis < 3; ++axis) {
             const float d = ray.direction[axis];
-            forward_[axis] = d >= 0.0f;
             // A ray along the other axes takes forever to cross this one.
             inverse_[axis] = std::abs(d) > 1e-30f ? 1.0f / d : 1e30f;
+            forward_[axis] = inverse_[axis] > 0.0f;
             const float to_low =
                 (static_cast<float>(tree.low()[axis]) - ray.origin[axis]) * inverse_[axis];
             const float to_high =
