@@ -10,6 +10,7 @@
 #include <bit>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <vector>
 
 namespace pileus {
@@ -79,7 +80,7 @@ class BrickTree {
     const Bounds& bounds() const { return bounds_; }
 
     std::size_t bytes() const {
-        return nodes_.capacity() * sizeof(Node) + bricks_.capacity() * sizeof(Brick);
+        return nodes_.capacity() * sizeof(Node) + brick_count_ * sizeof(Brick);
     }
 
     bool contains(const V3i& cell) const {
@@ -96,8 +97,18 @@ class BrickTree {
                                                          : bricks_[found][entry(at, 0)]);
     }
 
+    /// The brick or constant that was read last: points that follow each other mostly share it.
+    struct Cursor {
+        V3i low{std::numeric_limits<int>::min()};
+        Child found = constant_bit;
+    };
+
     /// The field at x, interpolated trilinearly between the eight voxels around it.
-    float interpolate(const V3f& x) const;
+    float interpolate(const V3f& x, Cursor& cursor) const;
+    float interpolate(const V3f& x) const {
+        Cursor cursor;
+        return interpolate(x, cursor);
+    }
 
     /// The value of one of the eight voxels around x, drawn with its interpolation weight: its mean
     /// is the interpolated field. The three jitters are uniform in [0, 1).
@@ -149,7 +160,8 @@ class BrickTree {
     }
 
     std::vector<Node> nodes_;  // the root first
-    std::vector<Brick> bricks_;
+    std::unique_ptr<Brick[]> bricks_;
+    std::size_t brick_count_ = 0;
     int levels_ = 0;  // of nodes; a child at level l is width^l cells wide
     int extent_ = 0;
     float scale_ = 1.0f;  // a power of two: halves hold value / scale

@@ -7,6 +7,13 @@
 #include <cmath>
 #include <string>
 
+// Compiled for the baseline and, where the compiler can dispatch at load time, for AVX2.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__SANITIZE_THREAD__)
+#define PILEUS_DISPATCH __attribute__((target_clones("avx2", "default")))
+#else
+#define PILEUS_DISPATCH
+#endif
+
 namespace pileus {
 
 namespace {
@@ -16,19 +23,51 @@ using openvdb::CoordBBox;
 
 V3i to_v3i(const Coord& c) { return {c.x(), c.y(), c.z()}; }
 
-/// A density as the renderer takes it; what it cannot be becomes zero.
+/// The bits of a density as the renderer takes it: what it cannot be becomes zero. Positive floats
+/// order like their bits, so this and what follows is integer arithmetic that vectorizes on any
+/// machine.
+constexpr std::int32_t density_bits(float value, std::int32_t background) {
+    constexpr std::int32_t infinity = 0x7f800000;
+    const auto bits = std::bit_cast<std::int32_t>(value);
+    return bits > 0 && bits < infinity && bits != background ? bits : 0;
+}
+
+struct Scan {
+    std::int32_t max = 0;  // bits of the greatest density
+    bool odd = false;      // whether there is a NaN, infinite or negative value
+};
+
 template <class Value>
-float sanitized(Value value) {
-    const bool valid = value > Value(0) && std::isfinite(value);
-    return valid ? static_cast<float>(std::min<Value>(value, std::numeric_limits<float>::max()))
-                 : 0.0f;
+PILEUS_DISPATCH Scan scan(const Value* values, int count, std::int32_t background) {
+    constexpr std::int32_t infinity = 0x7f800000;
+    std::int32_t max = 0, odd = 0;
+    for (int i = 0; i < count; ++i) {
+        const auto value = static_cast<float>(values[i]);
+        const std::int32_t density = density_bits(value, background);
+        max = density > max ? density : max;
+        const auto bits = std::bit_cast<std::int32_t>(value);
+        odd |= (bits < 0 || bits >= infinity) ? 1 : 0;
+    }
+    return {max, odd != 0};
+}
+
+/// `factor` takes a density to a half's bits in a float's place: 2^-112 / scale.
+template <class Value>
+PILEUS_DISPATCH void encode(const Value* values, int count, std::int32_t background, float factor,
+                            Half* halves) {
+    for (int i = 0; i < count; ++i) {
+        const float density =
+            std::bit_cast<float>(density_bits(static_cast<float>(values[i]), background));
+        const auto bits = std::bit_cast<std::uint32_t>(density * factor);
+        halves[i] = static_cast<Half>((bits + 0xfffu + ((bits >> 13) & 1u)) >> 13);
+    }
 }
 
 template <class Value>
 void count(Value value, std::int64_t times, Census& census) {
     if (std::isnan(value)) {
         census.nan += times;
-    } else if (std::isinf(value)) {
+    } else if (std::isinf(static_cast<float>(value))) {
         census.infinite += times;
     } else if (value < Value(0)) {
         census.negative += times;
@@ -48,25 +87,30 @@ struct Range {
 /// them all.
 using Sides = std::array<Range, 8>;
 
-Sides sides_of(const BrickTree::Brick& brick) {
-    Sides sides;
-    for (unsigned i = 0; i < BrickTree::entries; ++i) {
-        const unsigned zero =
-            ((i >> 6) == 0 ? 4u : 0u) | ((i >> 3 & 7) == 0 ? 2u : 0u) | ((i & 7) == 0 ? 1u : 0u);
-        const Range value{brick[i], brick[i]};
-        // Only low sides have more than element 0 to feed: 169 of the 512 voxels.
-        for (unsigned m = zero;; m = (m - 1) & zero) {
-            sides[m].include(value);
-            if (m == 0) break;
+/// The range over `rows` rows of 8 voxels, each `step` apart, the rows `pitch` apart.
+template <int rows, int pitch, int step>
+Range range_of_rows(const Half* voxels) {
+    Range range;
+    for (int row = 0; row < rows; ++row) {
+        for (int i = 0; i < 8; ++i) {
+            const Half value = voxels[row * pitch + i * step];
+            range.min = std::min(range.min, value);
+            range.max = std::max(range.max, value);
         }
     }
-    return sides;
+    return range;
 }
 
-template <class Value>
+PILEUS_DISPATCH Sides sides_of(const Half* voxels) {
+    return {range_of_rows<64, 8, 1>(voxels), range_of_rows<8, 64, 8>(voxels),
+            range_of_rows<8, 64, 1>(voxels), range_of_rows<1, 0, 64>(voxels),
+            range_of_rows<8, 8, 1>(voxels),  range_of_rows<1, 0, 8>(voxels),
+            range_of_rows<1, 0, 1>(voxels),  Range{voxels[0], voxels[0]}};
+}
+
 struct Tile {
     CoordBBox box;
-    Value value;
+    float density;
 };
 
 }  // namespace
@@ -77,7 +121,8 @@ class BrickTreeBuilder {
     BrickTreeBuilder(int levels, std::size_t brick_count) {
         tree_.levels_ = levels;
         tree_.extent_ = 1 << (BrickTree::log2_width * (levels + 1));
-        tree_.bricks_.resize(brick_count);
+        tree_.bricks_ = std::make_unique_for_overwrite<BrickTree::Brick[]>(brick_count);
+        tree_.brick_count_ = brick_count;
         sides_.resize(brick_count);
         add_node(levels, V3i(0), BrickTree::constant(0));
     }
@@ -86,7 +131,7 @@ class BrickTreeBuilder {
     float scale() const { return tree_.scale_; }
 
     BrickTree::Brick& brick(std::size_t number) { return tree_.bricks_[number]; }
-    void measure(std::size_t number) { sides_[number] = sides_of(tree_.bricks_[number]); }
+    void measure(std::size_t number) { sides_[number] = sides_of(tree_.bricks_[number].data()); }
 
     /// Hangs a measured brick into the tree.
     void insert(std::size_t number, const V3i& low) {
@@ -252,53 +297,44 @@ namespace {
 
 /// Tiles above the leaves that hold something.
 template <class Tree>
-auto collect_tiles(const Tree& tree, Census& census) {
-    std::vector<Tile<typename Tree::ValueType>> tiles;
+auto collect_tiles(const Tree& tree, std::int32_t background, Census& census) {
+    std::vector<Tile> tiles;
     auto it = tree.cbeginValueAll();
     it.setMaxDepth(Tree::ValueAllCIter::LEAF_DEPTH - 1);
     for (; it; ++it) {
         if (it.isValueOn()) count(*it, static_cast<std::int64_t>(it.getVoxelCount()), census);
-        if (*it == tree.background() || sanitized(*it) == 0.0f) continue;
+        const std::int32_t bits = density_bits(static_cast<float>(*it), background);
+        if (bits == 0) continue;
         CoordBBox box;
         it.getBoundingBox(box);
-        tiles.push_back({box, *it});
+        tiles.push_back({box, std::bit_cast<float>(bits)});
     }
     return tiles;
 }
 
 template <class Tree>
 BuiltTree build(const Tree& tree) {
-    using Value = typename Tree::ValueType;
     using Leaf = typename Tree::LeafNodeType;
     using LeafRange = tbb::blocked_range<std::size_t>;
     static_assert(Leaf::DIM == BrickTree::width);
 
     BuiltTree built;
-    const auto tiles = collect_tiles(tree, built.census);
-    std::vector<const Leaf*> leaves;
-    tree.getNodes(leaves);
     // A value outside the stored region would fill all space; a density that is not zero there is
     // not one.
-    const Value background = tree.background();
-    const auto density = [background](Value value) {
-        return value == background ? 0.0f : sanitized(value);
-    };
+    const auto background = std::bit_cast<std::int32_t>(static_cast<float>(tree.background()));
+    const auto tiles = collect_tiles(tree, background, built.census);
+    std::vector<const Leaf*> leaves;
+    tree.getNodes(leaves);
 
     // The first pass reads what OpenVDB left on disk, counts, and finds what is there at all.
-    std::vector<float> greatest(leaves.size());
+    std::vector<std::int32_t> greatest(leaves.size());
     built.census += tbb::parallel_reduce(
         LeafRange(0, leaves.size()), Census{},
         [&](const LeafRange& range, Census census) {
             for (std::size_t l = range.begin(); l != range.end(); ++l) {
-                const Value* const values = leaves[l]->buffer().data();
-                bool odd = false;
-                float max = 0.0f;
-                for (unsigned i = 0; i < Leaf::SIZE; ++i) {
-                    max = std::max(max, density(values[i]));
-                    odd |= !(values[i] >= Value(0)) || std::isinf(values[i]);
-                }
-                greatest[l] = max;
-                if (!odd) continue;
+                const Scan found = scan(leaves[l]->buffer().data(), Leaf::SIZE, background);
+                greatest[l] = found.max;
+                if (!found.odd) continue;
                 for (auto it = leaves[l]->cbeginValueOn(); it; ++it) count(*it, 1, census);
             }
             return census;
@@ -309,14 +345,14 @@ BuiltTree build(const Tree& tree) {
     CoordBBox box;
     std::size_t kept = 0;
     for (std::size_t l = 0; l < leaves.size(); ++l) {
-        if (greatest[l] == 0.0f) continue;
-        max = std::max(max, greatest[l]);
+        if (greatest[l] == 0) continue;
+        max = std::max(max, std::bit_cast<float>(greatest[l]));
         box.expand(leaves[l]->getNodeBoundingBox());
         leaves[kept++] = leaves[l];
     }
     leaves.resize(kept);
     for (const auto& tile : tiles) {
-        max = std::max(max, sanitized(tile.value));
+        max = std::max(max, tile.density);
         box.expand(tile.box);
     }
     if (box.empty()) return built;
@@ -339,19 +375,18 @@ BuiltTree build(const Tree& tree) {
     // precision.
     builder.set_scale(std::ldexp(1.0f, std::max(std::ilogb(max) - 14, -100)));
     const float inverse_scale = 1.0f / builder.scale();
+    const float factor = inverse_scale * 0x1p-112f;
     tbb::parallel_for(LeafRange(0, leaves.size()), [&](const LeafRange& range) {
         for (std::size_t l = range.begin(); l != range.end(); ++l) {
-            const Value* const values = leaves[l]->buffer().data();
-            BrickTree::Brick& brick = builder.brick(l);
-            for (unsigned i = 0; i < Leaf::SIZE; ++i)
-                brick[i] = encode_half(density(values[i]) * inverse_scale);
+            encode(leaves[l]->buffer().data(), Leaf::SIZE, background, factor,
+                   builder.brick(l).data());
             builder.measure(l);
         }
     });
     const auto local = [&](const Coord& c) { return to_v3i(c) - built.origin; };
     for (const auto& tile : tiles) {
         builder.fill(local(tile.box.min()), local(tile.box.max().offsetBy(1)),
-                     encode_half(sanitized(tile.value) * inverse_scale));
+                     encode_half(tile.density * inverse_scale));
     }
     for (std::size_t l = 0; l < leaves.size(); ++l) builder.insert(l, local(leaves[l]->origin()));
     built.tree = builder.finish(local(box.min()) - V3i(1), local(box.max()) + V3i(1));

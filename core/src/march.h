@@ -19,48 +19,51 @@ class DensityMarch {
         steps_.clear();
         const float speed = std::max(
             {std::abs(ray.direction.x), std::abs(ray.direction.y), std::abs(ray.direction.z)});
-        float depth = 0.0f;
+        depth_ = 0.0f;
         MajorantIterator majorants = medium.majorants(ray);
         MajorantSegment segment;
-        while (depth < opaque && majorants.next(segment)) {
+        BrickTree::Cursor cursor;
+        while (depth_ < opaque && majorants.next(segment)) {
             const float length = segment.end - segment.begin;
             const int count = std::max(1, static_cast<int>(std::ceil(length * speed)));
             const float dt = length / static_cast<float>(count);
-            for (int i = 0; i < count && depth < opaque; ++i) {
+            for (int i = 0; i < count && depth_ < opaque; ++i) {
                 const float t = segment.begin + static_cast<float>(i) * dt;
-                const float sigma = medium.extinction(ray.at(t + jitter * dt));
+                const float sigma = medium.extinction(ray.at(t + jitter * dt), cursor);
                 if (sigma <= 0.0f) continue;
-                const float before = opacity();
-                depth += sigma * dt;
-                steps_.push_back({t, sigma, before, -std::expm1(-depth)});
+                steps_.push_back({t, sigma, depth_});
+                depth_ += sigma * dt;
             }
         }
     }
 
     /// 1 - T of the whole ray: the chance that light along it is scattered or absorbed at all.
-    float opacity() const { return steps_.empty() ? 0.0f : steps_.back().after; }
+    float opacity() const { return depth_ < opaque ? -std::expm1(-depth_) : 1.0f; }
 
-    /// The distance at which the share u in [0, 1) of `opacity` is reached. Within a step the
-    /// extinction is constant, so the bins weigh (1 - exp(-sigma d)) T, and are inverted exactly.
+    /// The distance at which the share u in [0, 1) of `opacity` is reached, the extinction being
+    /// constant in each step: the bins weigh (1 - exp(-sigma d)) T, and are inverted exactly. Only
+    /// where there is any opacity.
     float invert(float u) const {
-        const float target = u * opacity();
-        const auto step =
-            std::upper_bound(steps_.begin(), steps_.end() - 1, target,
-                             [](float value, const Step& s) { return value < s.after; });
-        // T(t) = T(begin) exp(-sigma (t - begin)) = 1 - target
-        const float share = (target - step->before) / (1.0f - step->before);
-        return step->begin - std::log1p(-std::min(share, 0.999999f)) / step->sigma;
+        const float depth = -std::log1p(u * std::expm1(-depth_));
+        const auto above =
+            std::upper_bound(steps_.begin() + 1, steps_.end(), depth,
+                             [](float value, const Step& s) { return value < s.depth; });
+        const Step& step = *(above - 1);
+        return step.begin + (depth - step.depth) / step.sigma;
     }
 
   private:
     struct Step {
         float begin, sigma;
-        float before, after;  // opacity from the ray's start to the step's begin and end
+        float depth;  // optical depth from the ray's start to the step's begin
     };
 
-    static constexpr float opaque = 16.0f;  // optical depth at which 1 - T is 1 in float
+    // The march ends here, and the ray counts as opaque: the last e^-8 of the light is spread over
+    // what was marched, which shifts one event in 3,000 and loses none.
+    static constexpr float opaque = 8.0f;
 
     std::vector<Step> steps_;
+    float depth_ = 0.0f;
 };
 
 }  // namespace pileus

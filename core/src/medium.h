@@ -48,6 +48,9 @@ class Medium {
 
     /// sigma_t at a local position inside the box: one interpolated voxel.
     float extinction(const V3f& x) const { return extinction_ * tree_->interpolate(x); }
+    float extinction(const V3f& x, BrickTree::Cursor& cursor) const {
+        return extinction_ * tree_->interpolate(x, cursor);
+    }
 
     /// An unbiased estimate of sigma_t that reads a single voxel, never above the majorant.
     float extinction_tap(const V3f& x, Random& random) const {
