@@ -185,9 +185,13 @@ class Farm:
 
     def _timed(self, view: JobView) -> JobView:
         """Adds frame numbers for indices, and the time left, from the pace so far."""
-        job = self.store.job(view.id)
-        numbers = job.shot.frame_numbers if job and view.active else []
-        active = [frame.model_copy(update={"frame": numbers[frame.frame]}) for frame in view.active]
+        job = self.store.job(view.id) if view.active else None
+        numbers = job.shot.frame_numbers if job else []
+        active = [
+            frame.model_copy(update={"frame": numbers[frame.frame]})
+            for frame in view.active
+            if numbers
+        ]
         left = None
         if view.state is JobState.RUNNING and view.started and view.progress > 0:
             spent = max(0.0, time.time() - view.started)

@@ -1,6 +1,7 @@
 """Frame ranges ("1-10,20-30x2") and the frame patterns of file names (####, %04d, $F4)."""
 
 import re
+from functools import lru_cache
 
 MAX_FRAMES = 100_000
 
@@ -8,7 +9,8 @@ _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9})(?:x(\d{1,9}))?)?")
 _PATTERN = re.compile(r"#+|%(?:0?(\d{1,2}))?d|\$F(\d{1,2})?")
 
 
-def parse_frames(text: str) -> list[int]:
+@lru_cache(64)
+def parse_frames(text: str) -> tuple[int, ...]:
     """The frames of a range in rising order, each once."""
     frames: set[int] = set()
     for part in text.split(","):
@@ -25,7 +27,7 @@ def parse_frames(text: str) -> list[int]:
         frames.update(range(first, last + 1, step))
         if len(frames) > MAX_FRAMES:
             raise ValueError(f"over {MAX_FRAMES} frames; split the shot")
-    return sorted(frames)
+    return tuple(sorted(frames))
 
 
 def has_pattern(name: str) -> bool:

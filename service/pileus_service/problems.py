@@ -74,6 +74,10 @@ def install(app: FastAPI) -> None:
     def no_redis(_: Request, error: RedisError) -> JSONResponse:
         return _answer(503, "Redis does not answer; try again", [], {"Retry-After": "2"})
 
+    @app.exception_handler(OSError)
+    def no_disk(_: Request, error: OSError) -> JSONResponse:
+        return _answer(503, f"The data folder fails: {error.strerror}", [], {"Retry-After": "10"})
+
     @app.exception_handler(Exception)
     def unforeseen(_: Request, error: Exception) -> JSONResponse:
         return _answer(500, "An unforeseen error; the service's log has it", [])

@@ -272,7 +272,7 @@ class Shot(Model):
         return self
 
     @property
-    def frame_numbers(self) -> list[int]:
+    def frame_numbers(self) -> tuple[int, ...]:
         return parse_frames(self.frames)
 
     def warnings(self) -> list[str]:

@@ -10,8 +10,9 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from pydantic import ValidationError
 
@@ -131,6 +132,14 @@ class Store:
 def _read(path: Path, kind: type[R]) -> R | None:
     """The record of a file; a damaged one counts as absent, so that it is made again."""
     try:
-        return kind.model_validate_json(path.read_bytes())
+        found = path.stat()
+        record = _parsed(path, found.st_ino, found.st_mtime_ns, found.st_size, kind)
     except (FileNotFoundError, NotADirectoryError, ValidationError):
         return None
+    return cast(R, record)
+
+
+@lru_cache(32)
+def _parsed(path: Path, inode: int, mtime_ns: int, size: int, kind: type[Record]) -> Record:
+    """Parses a file once: as each is written whole, another inode or time is another record."""
+    return kind.model_validate_json(path.read_bytes())

@@ -40,6 +40,7 @@ def shot(name: str, *settings: str) -> Shot:
             f"name={name}",
             f"frames='{FRAMES}'",
             "image.width=640",
+            "sampling.samples=16",
             "image.height=360",
             f"image.output='{FOLDER}/frames/{name}.####.exr'",
             f"volumes.0.cache='{FOLDER}/caches/cumulus.####.vdb'",
@@ -87,3 +88,5 @@ if __name__ == "__main__":
         run()
     except (InputError, FarmError, core.InputError) as error:
         sys.exit(f"make demo: {error}")
+    except KeyboardInterrupt:
+        sys.exit("make demo: stopped")

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -19,31 +19,22 @@ from pileus_worker.lifeline import die_with_parent
 from pileus_worker.private_redis import PrivateRedis
 
 
-@dataclass
 class Workers:
     """The worker processes; one that dies is replaced."""
 
-    command: list[str]
-    count: int
-    log: IO[bytes]
-    _processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    _ending: threading.Event = field(default_factory=threading.Event)
-
-    def begin(self) -> None:
-        self._processes = [self._start() for _ in range(self.count)]
-
-    def pids(self) -> list[int]:
-        return [process.pid for process in self._processes]
+    def __init__(self, command: list[str], count: int, log: IO[bytes]) -> None:
+        self._command = command
+        self._log = log
+        self._processes = [self._start() for _ in range(count)]
 
     def keep_up(self) -> None:
-        """Replaces dead workers until the end, no faster than one a second."""
-        while not self._ending.wait(1.0):
-            self._processes = [
-                process if process.poll() is None else self._start() for process in self._processes
-            ]
+        """Replaces those that have died."""
+        self._processes = [
+            process if process.poll() is None else self._start() for process in self._processes
+        ]
 
     def end(self) -> None:
-        self._ending.set()
+        """Tells all to end, and sees to it."""
         for process in self._processes:
             process.terminate()
         end = time.monotonic() + 10
@@ -56,14 +47,25 @@ class Workers:
 
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
-            self.command,
+            self._command,
             stdin=subprocess.DEVNULL,
-            stdout=self.log,
-            stderr=self.log,
+            stdout=self._log,
+            stderr=self._log,
             # Away from the terminal's Ctrl-C: they are told in order.
             start_new_session=True,
             preexec_fn=die_with_parent,
         )
+
+
+def _keep_up(
+    ending: threading.Event, over: threading.Event, *parts: PrivateRedis | Workers
+) -> None:
+    """Starts again what dies, no faster than once a second."""
+    while not ending.wait(1.0):
+        for part in parts:
+            part.keep_up()
+    # To the kernel, the thread that started a process is its parent: we must outlive them.
+    over.wait()
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,7 @@ class EmbeddedFarm:
     """A farm that runs."""
 
     url: str
-    redis_url: str
-    workers: Workers
+    redis: PrivateRedis
 
 
 @contextlib.contextmanager
@@ -90,25 +91,25 @@ def embedded_farm(
     ):
         server = make_server(data, redis.url, roots, listen)
         workers = Workers(_command(data, redis.url, roots, count, task_seconds), count, log)
-        threads = [
-            threading.Thread(target=server.run, args=([listener],), name="service"),
-            threading.Thread(target=workers.keep_up, name="workers"),
-        ]
-        workers.begin()
+        ending, over = threading.Event(), threading.Event()
+        service = threading.Thread(target=server.run, args=([listener],), name="service")
+        keeper = threading.Thread(target=_keep_up, args=(ending, over, redis, workers), daemon=True)
         try:
-            for thread in threads:
-                thread.start()
+            service.start()
+            keeper.start()
             while not server.started:
-                if not threads[0].is_alive():
+                if not service.is_alive():
                     raise FarmError("the service ended at once")
                 time.sleep(0.02)
             host, port = listener.getsockname()[:2]
-            yield EmbeddedFarm(f"http://{_bracketed(host)}:{port}", redis.url, workers)
+            yield EmbeddedFarm(f"http://{_bracketed(host)}:{port}", redis)
         finally:
+            ending.set()
             workers.end()
             server.should_exit = True
-            for thread in threads:
-                thread.join()
+            service.join()
+            redis.end()
+            over.set()
 
 
 def _command(

@@ -79,8 +79,8 @@ def cut(
     while True:
         buckets = tiles(width, height, edge)
         dearest = max(_seconds(bucket, cost) for bucket in buckets) * samples
-        # Ranges of at least a few samples: below, the cost of a task is no longer hidden.
-        if edge == SMALLEST or dearest / seconds <= max(1, samples // 16):
+        # Large buckets and many ranges, but none of so few samples that its image is mostly noise.
+        if edge == SMALLEST or dearest / seconds <= max(1, samples // 4):
             break
         edge //= 2
     touched = [bucket for bucket in buckets if scene.touches(bucket)]

@@ -32,12 +32,22 @@ class PrivateRedis:
         return self._process.pid
 
     def __enter__(self) -> Self:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._start()
+        self._answers()
+        return self
+
+    def keep_up(self) -> None:
+        """Starts it again if it has died; it reads its file, and what that lacks is on disk."""
+        if self._process is not None and self._process.poll() is not None:
+            self._start()
+
+    def _start(self) -> None:
         program = shutil.which("redis-server")
         if program is None:
             raise FarmError(
                 "redis-server is not installed; on Debian: apt-get install redis-server"
             )
-        self._folder.mkdir(parents=True, exist_ok=True)
         options = {
             "port": "0",
             "unixsocket": str(self._socket),
@@ -46,7 +56,6 @@ class PrivateRedis:
             "appendonly": "yes",
             "save": "",
             "logfile": "redis.log",
-            "maxmemory-policy": "noeviction",
         }
         self._process = subprocess.Popen(
             [program, *(word for key, value in options.items() for word in (f"--{key}", value))],
@@ -56,8 +65,6 @@ class PrivateRedis:
             start_new_session=True,
             preexec_fn=die_with_parent,
         )
-        self._answers()
-        return self
 
     @retry(
         retry=retry_if_exception_type(UNREACHABLE),
@@ -77,6 +84,11 @@ class PrivateRedis:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.end()
+        shutil.rmtree(self._socket_folder, ignore_errors=True)
+
+    def end(self) -> None:
+        """Stops it, its file written."""
         if self._process is not None:
             self._process.terminate()
             try:
@@ -84,4 +96,3 @@ class PrivateRedis:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-        shutil.rmtree(self._socket_folder, ignore_errors=True)

@@ -17,11 +17,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from tenacity import RetryError, Retrying, retry_if_exception_type, stop_when_event_set
+from redis.exceptions import RedisError
+from tenacity import (
+    RetryError,
+    Retrying,
+    before_sleep_log,
+    retry_if_exception_type,
+    stop_when_event_set,
+)
 from tenacity.wait import wait_random_exponential
 
 from pileus_service.jobs import Task, WorkerInfo
-from pileus_service.queue import RENEWAL, UNREACHABLE, Queue
+from pileus_service.queue import RENEWAL, Queue
 from pileus_service.store import Store
 from pileus_worker import child
 
@@ -138,7 +145,9 @@ class Supervisor:
             while not stop.is_set():
                 try:
                     task = self._queue.claim(self.info)
-                except UNREACHABLE:
+                except RedisError as error:
+                    # Away, loading, or its disk is full: it comes back, and we are here then.
+                    log.warning("no tasks to be had: %s", error)
                     task = None
                 if task is None:
                     stop.wait(IDLE * random.uniform(0.5, 1.5))
@@ -146,7 +155,7 @@ class Supervisor:
                     self._attempt(task, stop)
             try:
                 self._queue.leave(self.info.name)
-            except UNREACHABLE:
+            except RedisError:
                 log.info("Redis is gone before us; nothing to say goodbye to")
         finally:
             self._drop_child()
@@ -208,9 +217,9 @@ class Supervisor:
                         self._stop_child(renderer)
                         self._queue.hand_back(task, self.info.name)
                         return None
-            except UNREACHABLE:
+            except RedisError as error:
                 # The work stays good: the lease is renewed, or found lost, when Redis is back.
-                log.warning("Redis does not answer; going on with %s", task)
+                log.warning("going on with %s: %s", task, error)
                 if stop.is_set():
                     return None
             used = renderer.memory()
@@ -223,9 +232,10 @@ class Supervisor:
     def _insist(self, stop: threading.Event) -> Retrying:
         """Tries until Redis is back: what was done must be said, unless we are to end."""
         return Retrying(
-            retry=retry_if_exception_type(UNREACHABLE),
+            retry=retry_if_exception_type(RedisError),
             wait=wait_random_exponential(max=2),
             stop=stop_when_event_set(stop),
+            before_sleep=before_sleep_log(log, logging.WARNING),
         )
 
     def _stop_child(self, renderer: Child) -> None:
