@@ -42,14 +42,14 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def real_shot(shot: dict[str, Any], caches: Path) -> Shot:
     """Small, and yet several buckets and sample ranges a frame where tasks are planned short."""
     shot["volumes"][0]["cache"] = str(caches / "cloud.####.vdb")
-    shot["image"] |= {"width": 96, "height": 64}
-    shot["sampling"]["samples"] = 48
+    shot["image"] |= {"width": 64, "height": 48}
+    shot["sampling"]["samples"] = 24
     return Shot.model_validate(shot)
 
 
 @pytest.fixture
 def farm(tmp_path: Path, caches: Path) -> Iterator[EmbeddedFarm]:
-    with embedded_farm(tmp_path / "farm", [tmp_path, caches], 2, "127.0.0.1:0", 0.05) as farm:
+    with embedded_farm(tmp_path / "farm", [tmp_path, caches], 2, "127.0.0.1:0", 0.02) as farm:
         yield farm
 
 

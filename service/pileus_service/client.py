@@ -89,7 +89,7 @@ class Client:
     def _ask(self, verb: str, path: str, **more: Any) -> httpx.Response:
         try:
             answer = self._http.request(verb, path, **more)
-        except httpx.InvalidURL as error:
+        except (httpx.InvalidURL, httpx.UnsupportedProtocol) as error:
             raise InputError(f"--server {self._server}: {error}") from None
         except httpx.TransportError as error:
             raise FarmError(

@@ -59,12 +59,13 @@ class Farm:
     def control(self, job_id: str, verb: Verb, priority: int = 0) -> JobView | None:
         """Pauses, resumes, cancels a job or changes its priority."""
         with self._lock:
-            if self.job(job_id) is None:
-                return None
+            view = self.job(job_id)
+            if view is None or view.state in TERMINAL:
+                return view
             wish = self.store.wished(job_id)
             if verb == "priority":
                 wish = wish.model_copy(update={"priority": priority})
-            elif wish.state not in TERMINAL:
+            else:
                 state = {"pause": "paused", "resume": "running", "cancel": "cancelled"}[verb]
                 wish = wish.model_copy(update={"state": state})
             self._keep(job_id, wish)

@@ -47,9 +47,9 @@ def connect(url: str) -> "Redis":
     return Redis.from_url(
         url,
         decode_responses=True,
-        socket_timeout=10,
+        socket_timeout=5,
         socket_connect_timeout=5,
-        retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=5),
+        retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=3),
         retry_on_error=[*UNREACHABLE],
     )
 

@@ -1,0 +1,119 @@
+"""The commands that need no farm: what they write, what they refuse, how they end."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+import pytest
+
+from pileus_worker import planning
+from pileus_worker.commands.compare import compared
+
+PILEUS = str(Path(sys.executable).with_name("pileus"))
+
+
+def pileus(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([PILEUS, *map(str, arguments)], capture_output=True, text=True)
+
+
+def refused(ended: subprocess.CompletedProcess[str]) -> str:
+    """The one line of a command that was given wrong input."""
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.count("\n") == 1
+    return ended.stderr
+
+
+@pytest.fixture
+def shot_file(tmp_path: Path, shot: dict[str, Any]) -> Path:
+    (tmp_path / "caches").mkdir()
+    for frame in (1, 2):
+        path = tmp_path / "caches" / f"cloud.{frame:04d}.vdb"
+        core.make_cloud(str(path), frame=frame, frames=2, resolution=32)
+    file = tmp_path / "shot.json"
+    file.write_text(json.dumps({**shot, "frames": "1-2"}))
+    return file
+
+
+def test_render_writes_each_frame_and_reports_it(shot_file: Path, tmp_path: Path) -> None:
+    ended = pileus("render", shot_file, "--frames", "2", "--set", "image.orders=true", "--json")
+    assert ended.returncode == 0, ended.stderr
+    [report] = json.loads(ended.stdout)["frames"]
+    assert report.keys() == {
+        "frame", "file", "seconds", "load_seconds", "render_seconds",
+        "samples", "method", "max_bounces", "reason",
+    }  # fmt: skip
+    assert (report["frame"], report["samples"], report["max_bounces"]) == (2, 4, 4)
+    [channels] = core.read_image(str(tmp_path / "out" / "test.0002.exr")).values()
+    expected = {*"RGBAZ", "variance.R", "variance.G", "variance.B"}
+    expected |= {f"order{order:02d}.{channel}" for order in range(4) for channel in "RGB"}
+    assert channels.keys() == expected
+    assert channels["R"].shape == (32, 48)
+
+
+def test_wrong_input_of_render_is_one_line_and_exit_code_two(
+    shot_file: Path, tmp_path: Path
+) -> None:
+    line = refused(pileus("render", shot_file, "--set", "volumes.0.density=smoke"))
+    assert "smoke" in line
+    assert "density" in line
+    assert "samples = 0" in refused(pileus("render", shot_file, "--set", "sampling.samples=0"))
+    assert "gap of 1 of 3" in refused(pileus("render", shot_file, "--frames", "1-3"))
+    (tmp_path / "file").touch()
+    assert "image.output" in refused(pileus("render", shot_file, "--out", tmp_path / "file"))
+    (tmp_path / "caches" / "cloud.0001.vdb").write_bytes(b"not a vdb")
+    assert "cloud.0001.vdb" in refused(pileus("render", shot_file))
+
+
+def test_make_writes_a_sequence(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "cloud.$F3.vdb"
+    ended = pileus("make", "cloud", out, "--frames", "1-2", "--resolution", "32")
+    assert ended.returncode == 0, ended.stderr
+    for name in ("cloud.001.vdb", "cloud.002.vdb"):
+        assert core.Volume(str(tmp_path / "new" / name)).active_voxels > 0
+    assert "put ####" in refused(pileus("make", "cloud", tmp_path / "a.vdb", "--frames", "1-2"))
+
+
+def test_compare_tells_the_error_as_it_is_defined(shot_file: Path, tmp_path: Path) -> None:
+    image, reference = np.full((2, 2, 3), 0.5), np.full((2, 2, 3), 0.25)
+    result = compared(image, reference)
+    assert result.rel_mse == pytest.approx(0.25**2 / (0.25**2 + 0.01))
+    assert result.mean_ratio == pytest.approx(2.0)
+    assert result.largest_error == pytest.approx(0.25)
+    assert pileus("render", shot_file).returncode == 0
+    first, second = (tmp_path / "out" / f"test.{frame:04d}.exr" for frame in (1, 2))
+    same = json.loads(pileus("compare", first, first, "--json").stdout)
+    assert same == {"rel_mse": 0.0, "mean_ratio": 1.0, "largest_error": 0.0}
+    difference = tmp_path / "difference.png"
+    ended = pileus("compare", first, second, "--difference", difference)
+    assert ended.stdout.startswith("relMSE ")
+    assert difference.read_bytes().startswith(b"\x89PNG")
+    assert "nowhere.exr" in refused(pileus("compare", first, tmp_path / "nowhere.exr"))
+
+
+@pytest.mark.parametrize("seconds", [1e-4, 0.01, 100.0])
+@pytest.mark.parametrize("size", [(48, 32), (130, 70), (512, 512)])
+def test_a_plan_covers_each_pixel_with_each_sample_once(
+    shot_file: Path, tmp_path: Path, size: tuple[int, int], seconds: float
+) -> None:
+    volume = core.Volume(str(tmp_path / "caches" / "cloud.0001.vdb"))
+    camera = core.Camera(position=(0, 0, 9), look_at=(0, 0, 0), up=(0, 1, 0), fov=30)
+    view = core.Scene(
+        volume=volume, extinction=9.0, albedo=(1, 1, 1), anisotropy=0.0, camera=camera,
+        lights=[], width=size[0], height=size[1],
+    )  # fmt: skip
+    cell = 64
+    columns, rows = -(-size[0] // cell), -(-size[1] // cell)
+    cost = planning.Cost(cell, columns, [1e-6 * (1 + i) for i in range(columns * rows)])
+    parts, empty = planning.cut(view, cost, size, 20, seconds)
+    spans: dict[tuple[int, int, int, int], int] = dict.fromkeys(empty, 20)
+    for part in parts:
+        assert part.samples[0] == spans.get(part.bucket, 0) < part.samples[1]
+        spans[part.bucket] = part.samples[1]
+    assert set(spans.values()) == {20}
+    # The renderer's own plan refuses buckets that overlap or leave a pixel out.
+    core.Frame(*size, list(spans.items()))
+    assert not any(view.touches(bucket) for bucket in empty)
