@@ -37,7 +37,8 @@ constexpr float kBillow = 0.52F;          // height of a billow in cells
 constexpr int kMostOctaves = 8;
 constexpr float kBlend = 0.018F;  // puffs melt together over this length
 constexpr float kVeil = 0.04F;    // wisps trail this far out
-constexpr float kReach = 0.13F;   // displacement and wisps never go further out
+constexpr float kReach = 0.09F;   // billows and wisps together go no further out
+constexpr float kBite = 0.08F;    // and erosion no further in
 
 struct Puff {
     Vec3f centre;
@@ -91,7 +92,8 @@ std::vector<Puff> towers(noise::Random& random) {
             if (at.y() + radius > top) break;
             const float step = radius * random(0.7F, 0.95F);
             radius *= random(0.80F, 1.0F);
-            at += Vec3f(random(-0.6F, 0.75F) * step, step, random(-0.6F, 0.6F) * step);
+            const float back = random(-0.6F, 0.6F) * step;
+            at += Vec3f(random(-0.6F, 0.75F) * step, step, back);
         }
     }
 
@@ -176,8 +178,8 @@ class Cumulus {
             high = openvdb::math::maxComponent(high, p.centre + Vec3f(p.radius));
         }
         const Vec3f drift(kWind * time_, 0.0F, 0.0F);
-        low += drift - Vec3f(kReach + kBlend);
-        high += drift + Vec3f(kReach + kBlend);
+        low += drift - Vec3f(reach());
+        high += drift + Vec3f(reach());
         const auto brick_of = [&](float x) {
             return static_cast<int>(std::floor(x / (voxel_ * kBrick)));
         };
@@ -226,6 +228,12 @@ class Cumulus {
     static constexpr int kBlockSide = 4;
     static_assert(kBlockSide * kBlockSide * kBlockSide == noise::kBatch);
 
+    // Half the width of a crisp edge.
+    float crisp() const { return 1.1F * voxel_; }
+
+    // Nothing is further than this from the nearest puff.
+    float reach() const { return kReach + kBlend + crisp(); }
+
     // Position in the frame that drifts with the cloud.
     Vec3f place(const Coord& ijk) const {
         return Vec3f(static_cast<float>(ijk.x()) * voxel_ - kWind * time_,
@@ -238,13 +246,13 @@ class Cumulus {
         const float half = 0.5F * static_cast<float>(side - 1) * voxel_;
         const float radius = half * 1.7321F;
         const Vec3f centre = place(origin) + Vec3f(half);
-        if (centre.y() + half < kBase - kVeil) return {};
+        if (centre.y() + half < kBase - reach()) return {};
         const auto distance = [&](const Puff& puff) {
             return (centre - puff.centre).length() - puff.radius;
         };
         float closest = std::numeric_limits<float>::max();
         for (const Puff& puff : puffs) closest = std::min(closest, distance(puff));
-        if (closest > radius + kReach + kBlend) return {};
+        if (closest > radius + reach()) return {};
         std::vector<Puff> near;
         std::copy_if(puffs.begin(), puffs.end(), std::back_inserter(near), [&](const Puff& puff) {
             return distance(puff) < closest + 2.0F * radius + 3.0F * kBlend;
@@ -312,7 +320,7 @@ class Cumulus {
         crown.fill(1.0F);
         for (const noise::Worley& octave : billows_) {
             const auto [low, high] = std::minmax_element(distance.begin(), distance.end());
-            if (*low > growth + kVeil || *high < -growth - 2.0F * kVeil) return;
+            if (*low > growth + kVeil || *high < -growth - kBite) return;
             turn(q);
             const Values f = octave.nearest_squared(q);
             const float height = kBillow * octave.cell();
@@ -329,9 +337,9 @@ class Cumulus {
     // edge widens, is eaten into and trails veils.
     float density_at(const Vec3f& p, float billowed) const {
         const float under = kBase - p.y();
-        const float crisp = 1.1F * voxel_;
-        float d = std::max(billowed, under);
-        if (d > kVeil || d < -kVeil - crisp) return d < 0.0F ? 1.0F : 0.0F;
+        const float d = std::max(billowed, under);
+        if (d > std::max(kVeil, crisp())) return 0.0F;
+        if (d < -std::max(kBite, crisp())) return 1.0F;
 
         // Patches of the windward side stay crisp; noise is asked only where it can matter.
         const float side = -p.x() - 0.3F * p.y();
@@ -342,9 +350,9 @@ class Cumulus {
                              side + 0.32F * noise::gradient(p * 7.0F, 0.4F * time_, seed_ ^ 0x71U));
         const float ragged = smoothstep(0.05F, 0.0F, p.y() - kBase);
         const float mixing = std::max(0.9F * windward, 0.7F * ragged);
-        if (mixing < 0.02F) return smoothstep(crisp, -crisp, d);
+        if (mixing < 0.02F) return smoothstep(crisp(), -crisp(), d);
 
-        const float soft = crisp + 0.016F * mixing;
+        const float soft = crisp() + 0.016F * mixing;
         if (d < -soft - 0.06F * mixing) return 1.0F;
         const Vec3f q((p.x() + 0.03F * time_) * 13.0F, p.y() * 19.0F, p.z() * 17.0F);
         const float air = noise::fractal(q, 0.7F * time_, seed_ ^ 0x77U, 3);

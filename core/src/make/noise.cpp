@@ -41,7 +41,15 @@ float slope(std::uint32_t h, float x, float y, float z, float w) {
 }  // namespace
 
 float Random::bell() {
-    return ((*this)() + (*this)() + (*this)() + (*this)() - 2.0F) * std::sqrt(3.0F);
+    float sum = -2.0F;
+    for (int i = 0; i < 4; ++i) sum += (*this)();
+    return sum * std::sqrt(3.0F);
+}
+
+Vec3f Random::bells() {
+    Vec3f v;
+    for (int axis = 0; axis < 3; ++axis) v[axis] = bell();
+    return v;
 }
 
 Vec3f Random::direction() {

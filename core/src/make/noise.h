@@ -49,7 +49,8 @@ inline float wave(float turns) {
     return 8.0F * t * (1.0F - 2.0F * std::abs(t));
 }
 
-// A stream of random numbers for laying out shapes.
+// A stream of random numbers for laying out shapes. One draw a statement: the order in which a
+// compiler evaluates arguments is its own.
 class Random {
   public:
     explicit Random(std::uint32_t seed) : state_(seed) {}
@@ -57,6 +58,7 @@ class Random {
     float operator()(float low, float high) { return low + (high - low) * (*this)(); }
     // Roughly normal with unit variance and no tail beyond 3.5.
     float bell();
+    Vec3f bells();
     Vec3f direction();
 
   private:

@@ -182,8 +182,8 @@ class Splash {
             for (int k = 0; k < kStrands; ++k) {
                 const float at = u + 0.012F * random.bell();
                 const Vec3f foot((at - 0.5F) * kFront, kWater, 0.022F * random.bell());
-                const Vec3f lean(tilt + 0.055F * random.bell(), 1.0F,
-                                 toward + 0.055F * random.bell());
+                const float aside = 0.055F * random.bell();
+                const Vec3f lean(tilt + aside, 1.0F, toward + 0.055F * random.bell());
                 throw_strand(random, foot, lean * (speed * random(0.55F, 1.05F)),
                              time_ - burst_time(at));
             }
@@ -198,7 +198,7 @@ class Splash {
         const float girth = random(0.6F, 1.25F);
         for (int i = 0; i < kDrops; ++i) {
             const float rank = (static_cast<float>(i) + random()) / kDrops;
-            const Vec3f apart(random.bell(), random.bell(), random.bell());
+            const Vec3f apart = random.bells();
             const float size = random();
             // Some drops are torn off early and stray.
             const bool stray = random() < 0.12F + 0.25F * rank;
@@ -237,7 +237,7 @@ class Splash {
         for (int i = 0; i < kPuffs; ++i) {
             const float u = random();
             const float rank = random();
-            const Vec3f apart(random.bell(), random.bell(), random.bell());
+            const Vec3f apart = random.bells();
             const float size = random();
             const float late = 0.30F * random();
             const float age = time_ - burst_time(u) - late;
@@ -360,9 +360,10 @@ class Splash {
         for (int block = 0; block < 8; ++block) {
             const Coord corner = Coord((block >> 2) * kBlockSide, ((block >> 1) & 1) * kBlockSide,
                                        (block & 1) * kBlockSide);
-            const Vec3f middle = place(origin + corner);
-            if (middle.y() > kWater + 0.11F + mound(middle.x(), middle.z()) ||
-                middle.y() < kWater - 0.11F) {
+            const float half = 0.5F * kBlockSide * voxel_;
+            const Vec3f middle = place(origin + corner) + Vec3f(half);
+            const float level = middle.y() - kWater;
+            if (level > 0.11F + half + mound(middle.x(), middle.z()) || level < -0.11F - half) {
                 continue;
             }
             Points at;
