@@ -1,6 +1,7 @@
 """The HTTP API over a real Redis, with the tests as its workers: answers, refusals, trust."""
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -144,8 +145,11 @@ def test_health_metrics_and_the_api_page(client: TestClient, shot: dict[str, Any
     assert client.get("/readyz").is_success
     assert 'pileus_tasks_waiting{priority="3"} 2.0' in client.get("/metrics").text
     assert client.get("/docs").is_success
-    paths = client.get("/openapi.json").json()["paths"]
-    assert "/v1/jobs/{job_id}/frames/{frame}/preview.png" in paths
+    document = client.get("/openapi.json")
+    assert "/v1/jobs/{job_id}/frames/{frame}/preview.png" in document.json()["paths"]
+    named = set(re.findall(r'"#/components/schemas/([^"]+)"', document.text))
+    assert "ProblemDocument" in named
+    assert named <= document.json()["components"]["schemas"].keys()
 
 
 def test_events_tell_each_change_until_the_end(

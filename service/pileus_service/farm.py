@@ -90,14 +90,14 @@ class Farm:
             if not self._restore(job_id):
                 return None
             view = self.queue.job(job_id)
-        return self._timed(view) if view else None
+        return self._numbered(view) if view else None
 
     def jobs(self, limit: int, offset: int) -> list[JobView]:
         """Newest first."""
         workers = self.queue.workers()
         ids = self.queue.job_ids()[::-1][offset : offset + limit]
         views = [self.queue.job(job_id, workers) for job_id in ids]
-        return [self._timed(view) for view in views if view]
+        return [self._numbered(view) for view in views if view]
 
     def frames(self, job_id: str, limit: int, offset: int) -> list[FrameView] | None:
         job, view = self.store.job(job_id), self.job(job_id)
@@ -184,8 +184,8 @@ class Farm:
         self.store.wish(job_id, wish)
         self._wishes[job_id] = wish
 
-    def _timed(self, view: JobView) -> JobView:
-        """Adds frame numbers for indices, and the time left, from the pace so far."""
+    def _numbered(self, view: JobView) -> JobView:
+        """Puts frame numbers in the place of indices."""
         job = self.store.job(view.id) if view.active else None
         numbers = job.shot.frame_numbers if job else []
         active = [
@@ -193,8 +193,4 @@ class Farm:
             for frame in view.active
             if numbers
         ]
-        left = None
-        if view.state is JobState.RUNNING and view.started and view.progress > 0:
-            spent = max(0.0, time.time() - view.started)
-            left = spent * (1 - view.progress) / view.progress
-        return view.model_copy(update={"active": active, "seconds_left": left})
+        return view.model_copy(update={"active": active})

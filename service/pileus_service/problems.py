@@ -48,7 +48,18 @@ def _answer(
 
 
 def install(app: FastAPI) -> None:
-    """Makes every error of the app a problem document."""
+    """Makes every error of the app a problem document, and says so in its OpenAPI page."""
+    describe = app.openapi
+
+    def with_problems() -> dict[str, Any]:
+        document = describe()
+        schemas = document["components"]["schemas"]
+        template = "#/components/schemas/{model}"
+        problem = ProblemDocument.model_json_schema(ref_template=template)
+        schemas |= {**problem.pop("$defs"), "ProblemDocument": problem}
+        return document
+
+    setattr(app, "openapi", with_problems)  # noqa: B010, the way FastAPI documents
 
     @app.exception_handler(HTTPException)
     def http(_: Request, error: HTTPException) -> JSONResponse:

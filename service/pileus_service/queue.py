@@ -107,6 +107,11 @@ class Queue:
         state = JobState(held["state"])
         if state is JobState.RUNNING and "started" not in held:
             state = JobState.QUEUED
+        left = None
+        gained = settled - int(held["restored"])
+        if state is JobState.RUNNING and gained > 0:
+            spent = self.now() - int(held["started"]) / 1000
+            left = spent * (frames - settled) / gained
         reason = f"frame {min(failed)}: {failed[min(failed)]}" if failed else None
         return JobView(
             id=job,
@@ -122,6 +127,7 @@ class Queue:
             created=int(held["created"]) / 1000,
             started=int(held["started"]) / 1000 if "started" in held else None,
             finished=int(held["finished"]) / 1000 if "finished" in held else None,
+            seconds_left=left,
             reason=reason,
             active=list(active.values()),
         )

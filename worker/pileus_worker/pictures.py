@@ -46,6 +46,7 @@ def write_png(path: Path, picture: Image) -> None:
 def contact_sheet(pictures: Sequence[Image], columns: int = 6, edge: int = 320) -> Image:
     """All pictures of a shot in reading order."""
     gap = 4
+    columns = min(columns, len(pictures))
     width, height = pictures[0].size
     size = (edge, max(1, round(edge * height / width)))
     rows = math.ceil(len(pictures) / columns)
