@@ -51,14 +51,14 @@ PILEUS_DISPATCH Scan scan(const Value* values, int count, std::int32_t backgroun
     return {max, odd != 0};
 }
 
-/// `factor` takes a density to a half's bits in a float's place: 2^-112 / scale.
+/// Halves of densities / scale. Two factors, for 2^-112 / scale may be too small for a float.
 template <class Value>
-PILEUS_DISPATCH void encode(const Value* values, int count, std::int32_t background, float factor,
-                            Half* halves) {
+PILEUS_DISPATCH void encode(const Value* values, int count, std::int32_t background,
+                            float inverse_scale, Half* halves) {
     for (int i = 0; i < count; ++i) {
         const float density =
             std::bit_cast<float>(density_bits(static_cast<float>(values[i]), background));
-        const auto bits = std::bit_cast<std::uint32_t>(density * factor);
+        const auto bits = std::bit_cast<std::uint32_t>(density * inverse_scale * 0x1p-112f);
         halves[i] = static_cast<Half>((bits + 0xfffu + ((bits >> 13) & 1u)) >> 13);
     }
 }
@@ -375,10 +375,9 @@ BuiltTree build(const Tree& tree) {
     // precision.
     builder.set_scale(std::ldexp(1.0f, std::max(std::ilogb(max) - 14, -100)));
     const float inverse_scale = 1.0f / builder.scale();
-    const float factor = inverse_scale * 0x1p-112f;
     tbb::parallel_for(LeafRange(0, leaves.size()), [&](const LeafRange& range) {
         for (std::size_t l = range.begin(); l != range.end(); ++l) {
-            encode(leaves[l]->buffer().data(), Leaf::SIZE, background, factor,
+            encode(leaves[l]->buffer().data(), Leaf::SIZE, background, inverse_scale,
                    builder.brick(l).data());
             builder.measure(l);
         }
