@@ -15,9 +15,8 @@ class Lobe {
   public:
     Lobe(const HenyeyGreenstein& phase, bool mixed) : phase_(phase), mixed_(mixed) {}
 
-    V3f sample(const V3f& in, Random& random) const {
-        const bool sphere = mixed_ && random.uniform() < 0.5f;
-        const float u1 = random.uniform(), u2 = random.uniform();
+    V3f sample(const V3f& in, float choice, float u1, float u2) const {
+        const bool sphere = mixed_ && choice < 0.5f;
         return sphere ? HenyeyGreenstein(0.0f).sample(in, u1, u2) : phase_.sample(in, u1, u2);
     }
 
@@ -31,6 +30,27 @@ class Lobe {
     bool mixed_;
 };
 
+/// The way from an event to a light, for one power of its transmittance after the other. Each power
+/// starts from the same random numbers, so a look does not notice the others.
+class Shadow {
+  public:
+    Shadow(const Medium& medium, const V3f& position, const V3f& direction, const Random& random)
+        : medium_(medium), ray_(medium.ray(position, direction)), random_(random) {}
+
+    float transmittance(float power) {
+        if (power == power_) return transmittance_;
+        power_ = power;
+        Random random = random_;
+        return transmittance_ = ratio_track(medium_, ray_, power, random);
+    }
+
+  private:
+    const Medium& medium_;
+    LocalRay ray_;
+    Random random_;
+    float power_ = 0.0f, transmittance_ = 1.0f;
+};
+
 }  // namespace
 
 DirectLight::DirectLight(const Scene& scene, const std::vector<Look>& looks, Sky sky)
@@ -41,23 +61,15 @@ void DirectLight::set_terms(int first, int last) {
     first_ = first;
     last_ = last;
     terms_.clear();
-    powers_.clear();
     for (std::size_t k = 0; k < looks_.size(); ++k) {
         for (int i = first; i < last; ++i) {
             const Look& look = looks_[k];
             const auto power = [i](float base) { return std::pow(base, static_cast<float>(i)); };
             terms_.push_back({k, i, power(look.b),
                               HenyeyGreenstein(power(look.c) * scene_.medium.phase().g()),
-                              sky_ == Sky::walk && look.physical()});
-            powers_.push_back(power(look.a));
+                              power(look.a), sky_ == Sky::walk && look.physical()});
         }
     }
-    transmittances_.resize(powers_.size());
-}
-
-void DirectLight::shadow(const ScatterEvent& event, const V3f& direction, Random& random) {
-    ratio_track(scene_.medium, scene_.medium.ray(event.position, direction), random, powers_,
-                transmittances_);
 }
 
 void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
@@ -73,41 +85,44 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         const auto order = static_cast<std::uint64_t>(first);
         // The light's own directions ...
         Random stream = random.stream(light_stream, order, l);
-        const float u1 = stream.uniform(), u2 = stream.uniform();
+        const float u1 = first == 0 ? random.second[0] : stream.uniform();
+        const float u2 = first == 0 ? random.second[1] : stream.uniform();
         if (const auto sample = light.sample(u1, u2)) {
-            shadow(event, sample->direction, stream);
+            const bool hit = light.can_be_hit();
             const float lobe_density =
-                light.can_be_hit() ? lobe.density(event.direction, sample->direction) : 0.0f;
+                hit ? lobe.density(event.direction, sample->direction) : 0.0f;
             const float walk_density =
-                light.can_be_hit() ? phase.density(event.direction, sample->direction) : 0.0f;
-            for (std::size_t k = 0; k < terms_.size(); ++k) {
-                if (transmittances_[k] == 0.0f) continue;
-                const Term& term = terms_[k];
+                hit ? phase.density(event.direction, sample->direction) : 0.0f;
+            Shadow shadow(scene_.medium, event.position, sample->direction, stream);
+            for (const Term& term : terms_) {
                 const float rival = term.walk ? walk_density : lobe_density;
                 const float share =
                     rival > 0.0f ? sample->density / (sample->density + rival) : 1.0f;
-                record.add(term.look, term.order,
-                           event.weight * sample->radiance *
-                               (share * term.weight * transmittances_[k] *
-                                term.phase.density(event.direction, sample->direction)));
+                const float scattered = term.phase.density(event.direction, sample->direction);
+                record.add(
+                    term.look, term.order,
+                    event.weight * sample->radiance *
+                        (share * term.weight * scattered * shadow.transmittance(term.power)));
             }
         }
         // ... and the phase function's, weighed against each other by the balance heuristic (Veach
         // 1997).
         if (!light.can_be_hit() || all_walk) continue;
         Random lobe_random = random.stream(lobe_stream, order, l);
-        const V3f direction = lobe.sample(event.direction, lobe_random);
+        const float choice = first == 0 ? random.first[3] : lobe_random.uniform();
+        const float v1 = first == 0 ? random.second[0] : lobe_random.uniform();
+        const float v2 = first == 0 ? random.second[1] : lobe_random.uniform();
+        const V3f direction = lobe.sample(event.direction, choice, v1, v2);
         const float density = lobe.density(event.direction, direction) + light.density(direction);
         const Color radiance = light.radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        shadow(event, direction, lobe_random);
-        for (std::size_t k = 0; k < terms_.size(); ++k) {
-            const Term& term = terms_[k];
-            if (term.walk || transmittances_[k] == 0.0f) continue;
+        Shadow shadow(scene_.medium, event.position, direction, lobe_random);
+        for (const Term& term : terms_) {
+            if (term.walk) continue;
+            const float scattered = term.phase.density(event.direction, direction);
             record.add(term.look, term.order,
                        event.weight * radiance *
-                           (term.weight * transmittances_[k] *
-                            term.phase.density(event.direction, direction) / density));
+                           (term.weight * scattered * shadow.transmittance(term.power) / density));
         }
     }
 }

@@ -16,15 +16,18 @@ namespace pileus {
 struct PathRandom {
     PathRandom(std::uint64_t pixel_key, std::uint32_t sample)
         : first(sobol::point(sample, hash_key(pixel_key, 0))),
-          key(hash_key(pixel_key, sample + 1ULL)) {}
+          second(sobol::point(sample, hash_key(pixel_key, 1))),
+          key(hash_key(pixel_key, sample + 2ULL)) {}
 
     Random stream(std::uint64_t purpose) const { return Random(hash_key(key, purpose)); }
     Random stream(std::uint64_t purpose, std::uint64_t a, std::uint64_t b) const {
         return Random(hash_key(hash_key(hash_key(key, purpose), a), b));
     }
 
-    std::array<float, sobol::dimensions>
-        first;  // the pixel's x and y, the first event's distance, one spare
+    // The pixel's x and y, the distance to the first event, and there the choice of lobe.
+    std::array<float, sobol::dimensions> first;
+    // At the first event: the direction towards a light, and the walk's.
+    std::array<float, sobol::dimensions> second;
     std::uint64_t key;
 };
 
@@ -81,7 +84,7 @@ enum class Sky {
 /// Adds the direct light at an event, Eq. 1 for the orders [first, last), to every look: for each
 /// light
 ///   sigma_s b^i L p(w_i, w_o, c^i g) exp(-a^i integral of sigma_t to the light).
-/// One shadow ray a light and technique serves all looks and orders.
+/// Looks share the directions, and the shadow rays where they share the power a^i.
 class DirectLight {
   public:
     DirectLight(const Scene& scene, const std::vector<Look>& looks, Sky sky);
@@ -100,18 +103,17 @@ class DirectLight {
         int order;
         float weight;
         HenyeyGreenstein phase;
+        float power;
         bool walk;  // its sky comes by the walk
     };
 
     void set_terms(int first, int last);
-    void shadow(const ScatterEvent& event, const V3f& direction, Random& random);
 
     const Scene& scene_;
     const std::vector<Look>& looks_;
     Sky sky_;
     int first_ = -1, last_ = -1;
     std::vector<Term> terms_;
-    std::vector<float> powers_, transmittances_;
 };
 
 }  // namespace pileus

@@ -5,26 +5,27 @@
 #include "medium.h"
 
 #include <optional>
-#include <span>
 
 namespace pileus {
 
-/// Calls visit(t, majorant) at each tentative collision along the ray, until it returns true or the
-/// ray has left the medium. The first free flight is given as an optical depth, so that the caller
-/// may stratify it. Returns whether a visit ended the ray.
+/// Calls visit(t, majorant of sigma_t) at each tentative collision along the ray, until it returns
+/// true or the ray has left the medium. Collisions come at `rate` times the majorant. The first
+/// free flight is given as an optical depth, so that the caller may stratify it. Returns whether a
+/// visit ended the ray.
 template <class Visit>
-bool track(const Medium& medium, const LocalRay& ray, float first_flight, Random& random,
-           Visit&& visit) {
+bool track(const Medium& medium, const LocalRay& ray, float rate, float first_flight,
+           Random& random, Visit&& visit) {
     MajorantIterator majorants = medium.majorants(ray);
     MajorantSegment segment;
     float flight = first_flight;
     while (majorants.next(segment)) {
         const float majorant = segment.majorant * medium.scale();
+        const float frequency = rate * majorant;
         float t = segment.begin;
         for (;;) {
-            const float step = flight / majorant;
+            const float step = flight / frequency;
             if (t + step >= segment.end) {
-                flight -= (segment.end - t) * majorant;
+                flight -= (segment.end - t) * frequency;
                 flight = std::max(flight, 0.0f);
                 break;
             }
@@ -41,33 +42,29 @@ bool track(const Medium& medium, const LocalRay& ray, float first_flight, Random
 inline std::optional<float> delta_track(const Medium& medium, const LocalRay& ray,
                                         float first_flight, Random& random) {
     float distance = 0.0f;
-    const bool collided = track(medium, ray, first_flight, random, [&](float t, float majorant) {
-        distance = t;
-        return random.uniform() * majorant < medium.extinction_tap(ray.at(t), random);
-    });
+    const bool collided =
+        track(medium, ray, 1.0f, first_flight, random, [&](float t, float majorant) {
+            distance = t;
+            return random.uniform() * majorant < medium.extinction_tap(ray.at(t), random);
+        });
     return collided ? std::optional(distance) : std::nullopt;
 }
 
-/// Ratio tracking (Novak et al. 2014) of several powers at once: afterwards transmittances[k]
-/// estimates T^powers[k] without bias, all from one walk along the ray; powers lie in [0, 1]. The
-/// power scales the extinction inside the estimator, for E[T^a] is not E[T]^a. Estimates below a
-/// tenth live on with that chance, each by the same random numbers whatever the others do.
-inline void ratio_track(const Medium& medium, const LocalRay& ray, Random& random,
-                        std::span<const float> powers, std::span<float> transmittances) {
+/// Ratio tracking (Novak et al. 2014): an unbiased estimate of T^power, for power in [0, 1]. The
+/// power scales the extinction inside the estimator, for E[T^a] is not E[T]^a, and the majorant
+/// with it: light that a look lets through easily is also cheap. Estimates below a tenth live on
+/// with that chance.
+inline float ratio_track(const Medium& medium, const LocalRay& ray, float power, Random& random) {
     constexpr float small = 0.1f;
-    std::fill(transmittances.begin(), transmittances.end(), 1.0f);
-    track(medium, ray, random.exponential(), random, [&](float t, float majorant) {
-        const float ratio = medium.extinction_tap(ray.at(t), random) / majorant;
-        const float chance = random.uniform() * small;
-        bool alive = false;
-        for (std::size_t k = 0; k < powers.size(); ++k) {
-            float& estimate = transmittances[k];
-            estimate *= 1.0f - powers[k] * ratio;
-            if (estimate < small) estimate = chance < estimate ? small : 0.0f;
-            alive |= estimate > 0.0f;
-        }
-        return !alive;
+    if (power == 0.0f) return 1.0f;
+    float transmittance = 1.0f;
+    track(medium, ray, power, random.exponential(), random, [&](float t, float majorant) {
+        transmittance *= 1.0f - medium.extinction_tap(ray.at(t), random) / majorant;
+        if (transmittance >= small) return false;
+        transmittance = random.uniform() * small < transmittance ? small : 0.0f;
+        return transmittance == 0.0f;
     });
+    return transmittance;
 }
 
 }  // namespace pileus

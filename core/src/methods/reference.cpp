@@ -29,7 +29,8 @@ class Reference final : public Method {
         ScatterEvent event{flight.at(*distance), ray.direction, medium.albedo()};
         for (int order = 0;; ++order) {
             light_.add(event, order, order + 1, random, record);
-            const float u1 = walk.uniform(), u2 = walk.uniform();
+            const float u1 = order == 0 ? random.second[2] : walk.uniform();
+            const float u2 = order == 0 ? random.second[3] : walk.uniform();
             const V3f direction = medium.phase().sample(event.direction, u1, u2);
             flight = medium.ray(event.position, direction);
             distance = delta_track(medium, flight, walk.exponential(), walk);
