@@ -1,7 +1,7 @@
 """Reads shots from TOML or JSON files, with `--set section.key=value` overrides."""
 
 import json
-import os
+import tempfile
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -47,8 +47,11 @@ def check_files(shot: Shot, source: str, frames: Iterable[int]) -> None:
                 f"frames, first {name}; make the file or leave the frame out of `frames`"
             )
         raise InputError(f"{source}: {field}: no such file {name}; mend the path")
-    for frame in frames:
-        _check_writable(shot.output(frame), source)
+    for output in {shot.output(frame) for frame in frames}:
+        if output.is_dir():
+            raise InputError(f"{source}: image.output: {output} is a folder; name a file")
+    for folder in {shot.output(frame).parent for frame in frames}:
+        _check_writable(folder, source)
 
 
 def _patterns(shot: Shot) -> Iterable[tuple[str, str]]:
@@ -58,12 +61,17 @@ def _patterns(shot: Shot) -> Iterable[tuple[str, str]]:
             yield f"lights.{index}.texture", light.texture
 
 
-def _check_writable(output: Path, source: str) -> None:
-    folder = next(parent for parent in output.parents if parent.exists())
-    if output.is_dir():
-        raise InputError(f"{source}: image.output: {output} is a folder; name a file")
-    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"{source}: image.output: cannot write in {folder}; choose another place")
+def _check_writable(folder: Path, source: str) -> None:
+    """Tries: permissions alone do not tell of read-only or full disks."""
+    there = next(each for each in (folder, *folder.parents) if each.exists())
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        reason = (error.strerror or "fails").lower()
+        raise InputError(
+            f"{source}: image.output: cannot write in {there} ({reason}); choose another place"
+        ) from None
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -46,8 +46,8 @@ def measure(
     threads: int,
     control: core.Control,
 ) -> Cost:
-    """Renders one sample of a few pixels in each cell of a coarse grid, timed; cells alike in
-    cost need no more, and the whole takes about a thousandth of the frame."""
+    """Times one sample of a few pixels amid each cell of a coarse grid: a small part of the
+    frame's work, and near enough to cut it into tasks of like length."""
     width, height = size
     cell = math.ceil(max(width, height) / PILOT_CELLS)
     seconds = []

@@ -1,6 +1,7 @@
 """`pileus render`: a shot, here and now, in this process."""
 
 import json
+import signal
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -117,6 +118,8 @@ class Renderer:
                 while not wait([future], 0.1).done:
                     self._show(index, number, control.samples_done)
             except BaseException:
+                # It ends at once; a second Ctrl-C must not cut that short.
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
                 control.cancel()
                 raise
             return future.result()
