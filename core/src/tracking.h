@@ -21,6 +21,7 @@ bool track(const Medium& medium, const LocalRay& ray, float rate, float first_fl
     while (majorants.next(segment)) {
         const float majorant = segment.majorant * medium.scale();
         const float frequency = rate * majorant;
+        if (frequency == 0.0f) continue;  // without extinction, or with less than a float can hold
         float t = segment.begin;
         for (;;) {
             const float step = flight / frequency;

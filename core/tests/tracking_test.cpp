@@ -1,0 +1,204 @@
+// Delta tracking, ratio tracking and the density march against the exact optical depth of a rough
+// trilinear field.
+#include "tracking.h"
+
+#include "march.h"
+#include "support.h"
+
+#include <array>
+#include <cmath>
+#include <gtest/gtest.h>
+#include <vector>
+
+namespace pileus {
+namespace {
+
+/// A field of independent voxels beside a tile, and rays that meet both, or one, or start within,
+/// on a corner, and run along cells' faces.
+class TrackingTest : public testing::Test {
+  protected:
+    TrackingTest() {
+        const auto grid = test::noise_grid(20, 6, 0.1);
+        grid->tree().addTile(1, openvdb::Coord(24, 8, 8), 0.9f, true);
+        volume_ = test::volume_of(grid);
+        medium_.emplace(*volume_, 2.5f, Color(1.0f), 0.0f);
+        const V3d inside = world(V3d(9.3, 11.1, 4.7)), outside = world(V3d(-20.0, 13.0, 40.0));
+        rays_ = {
+            ray(outside, world(V3d(10.0, 9.0, 10.0)) - outside),
+            ray(inside, V3d(1.0, 0.1, 0.3)),
+            ray(inside, V3d(-0.2, -1.0, -0.4)),
+            ray(world(V3d(8.0, 8.0, 8.0)), V3d(1.0, 0.0, 0.0)),
+            ray(world(V3d(16.0, 16.0, 16.0)), V3d(-1.0, -1.0, -1.0)),
+            ray(world(V3d(0.0, 12.0, -9.0)), V3d(0.0, 0.0, 1.0)),
+        };
+    }
+
+    /// The world position of index coordinates.
+    static V3d world(const V3d& index) { return index * 0.1; }
+
+    LocalRay ray(const V3d& from, const V3d& along) const {
+        return medium_->ray(V3f(from * volume_->world_to_local()), V3f(along.normalized()));
+    }
+
+    double depth(const LocalRay& r, double end, double begin = 0.0) const {
+        return medium_->scale() *
+               test::optical_depth(volume_->tree(), V3d(r.origin), V3d(r.direction), begin, end);
+    }
+
+    static constexpr double everything = 20.0;  // world units: beyond the volume for all the rays
+    int tests() const { return static_cast<int>(rays_.size()); }
+
+    std::shared_ptr<const Volume> volume_;
+    std::optional<Medium> medium_;
+    std::vector<LocalRay> rays_;
+};
+
+TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
+    constexpr int samples = 200000, bins = 40;
+    for (std::size_t r = 0; r < rays_.size(); ++r) {
+        const LocalRay& along = rays_[r];
+        const double opacity = -std::expm1(-depth(along, everything));
+        ASSERT_GT(opacity, 0.05);
+        // Edges of equal probability, by bisection.
+        std::vector<double> edges;
+        for (int i = 1; i < bins; ++i) {
+            double low = 0.0, high = everything;
+            for (int step = 0; step < 60; ++step) {
+                const double middle = 0.5 * (low + high);
+                (-std::expm1(-depth(along, middle)) < opacity * i / bins ? low : high) = middle;
+            }
+            edges.push_back(low);
+        }
+        std::vector<int> counts(bins + 1);  // the last are those that leave
+        Random random(100 + r);
+        for (int i = 0; i < samples; ++i) {
+            const auto t = delta_track(*medium_, along, random.exponential(), random);
+            ++counts[t ? std::size_t(std::upper_bound(edges.begin(), edges.end(), double(*t)) -
+                                     edges.begin())
+                       : std::size_t(bins)];
+        }
+        double chi_square = 0.0;
+        for (int i = 0; i <= bins; ++i) {
+            const double expected = samples * (i < bins ? opacity / bins : 1.0 - opacity);
+            if (expected < 5.0) continue;
+            const double gap = counts[std::size_t(i)] - expected;
+            chi_square += gap * gap / expected;
+        }
+        EXPECT_LT(chi_square, test::chi_square_limit(0.9999, bins, tests())) << "ray " << r;
+    }
+}
+
+TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
+    constexpr int samples = 200000;
+    constexpr std::array<float, 5> powers{1.0f, 0.5f, 0.1f, 1e-6f, 0.0f};
+    for (std::size_t r = 0; r < rays_.size(); ++r) {
+        const double tau = depth(rays_[r], everything);
+        for (const float power : powers) {
+            Random random(200 + r);
+            std::vector<double> values;
+            for (int i = 0; i < samples; ++i) {
+                values.push_back(ratio_track(*medium_, rays_[r], power, random));
+            }
+            const auto [mean, error] = test::estimate(values);
+            const double limit = test::z_limit(0.9999, tests() * int(powers.size()));
+            // A power so small is hardly ever noticed, and then by an error that is as small.
+            EXPECT_NEAR(mean, std::exp(-power * tau), limit * error + 10.0 * 1e-6 * (power < 1e-3f))
+                << "ray " << r << ", T^" << power << ", tau " << tau;
+        }
+    }
+}
+
+TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
+    // Optical depths of hundreds: nearly all estimates end early, by roulette.
+    const Medium thick(*volume_, 60.0f, Color(1.0f), 0.0f);
+    for (const LocalRay& along : rays_) {
+        const double tau = 60.0 / 2.5 * depth(along, everything);
+        const float power = static_cast<float>(std::min(1.0, 3.0 / tau));
+        Random random(17);
+        std::vector<double> values;
+        for (int i = 0; i < 100000; ++i) {
+            values.push_back(ratio_track(thick, along, power, random));
+        }
+        const auto [mean, error] = test::estimate(values);
+        EXPECT_NEAR(mean, std::exp(-power * tau), test::z_limit(0.9999, tests()) * error);
+    }
+}
+
+TEST_F(TrackingTest, AMediumWithoutExtinctionIsNoObstacle) {
+    // A flight of no length through it is the one in 2^24 that could find no end.
+    const Medium clear(*volume_, 0.0f, Color(1.0f), 0.0f);
+    Random random(1);
+    for (const LocalRay& along : rays_) {
+        EXPECT_FALSE(delta_track(clear, along, 0.0f, random));
+        EXPECT_EQ(ratio_track(clear, along, 1.0f, random), 1.0f);
+        EXPECT_EQ(ratio_track(*medium_, along, 1e-45f, random), 1.0f);
+    }
+}
+
+TEST_F(TrackingTest, TheMarchSumsTheOpticalDepthWithoutBias) {
+    // Over its jitter, the march's depth has the exact depth as its mean; at many stratified
+    // jitters the sum is a fine quadrature.
+    constexpr int jitters = 512;
+    for (const LocalRay& along : rays_) {
+        const double tau = depth(along, everything);
+        ASSERT_LT(tau, 8.0) << "too thick for an opacity in float";
+        DensityMarch march;
+        double sum = 0.0;
+        for (int i = 0; i < jitters; ++i) {
+            march.march(*medium_, along, (float(i) + 0.5f) / jitters);
+            sum += -std::log1p(-double(march.opacity()));
+        }
+        EXPECT_NEAR(sum / jitters, tau, 1e-4 * tau + 2e-7 * std::exp(tau));
+    }
+}
+
+TEST_F(TrackingTest, TheMarchInvertsItsOwnOpacity) {
+    DensityMarch march;
+    for (const LocalRay& along : rays_) {
+        march.march(*medium_, along, 0.5f);
+        float previous = 0.0f;
+        for (int i = 0; i < 1000; ++i) {
+            const float u = float(i) / 1000.0f;
+            const float t = march.invert(u);
+            ASSERT_GE(t, previous * (1.0f - 1e-6f));
+            previous = t;
+            // Steps are at most a voxel long, and the field changes by less than one over a voxel:
+            // the depth up to t is the march's own up to that.
+            const double expected = -std::log1p(-double(u * march.opacity()));
+            ASSERT_NEAR(depth(along, t), expected, 0.25 * medium_->scale() * 0.1 * 4.0);
+        }
+        EXPECT_LT(march.invert(std::nextafter(1.0f, 0.0f)), everything);
+    }
+}
+
+TEST_F(TrackingTest, EventsOfTheMarchFollowTheExactDensityOnAverage) {
+    constexpr int samples = 100000;
+    // The mean distance of the first event, given that there is one, within a tenth of a voxel of
+    // the exact one.
+    for (std::size_t r = 0; r < rays_.size(); ++r) {
+        const LocalRay& along = rays_[r];
+        const double opacity = -std::expm1(-depth(along, everything));
+        // E[t; event] = integral of t dP = integral of (P(all) - P(t)) dt.
+        double expected = 0.0, tau = 0.0;
+        constexpr int steps = 4000;
+        for (int i = 0; i < steps; ++i) {
+            const double width = everything / steps;
+            const double half = depth(along, (i + 0.5) * width, i * width);
+            expected += width * (opacity + std::expm1(-(tau + half)));
+            tau += half + depth(along, (i + 1.0) * width, (i + 0.5) * width);
+        }
+        expected /= opacity;
+        std::vector<double> values;
+        Random random(300 + r);
+        DensityMarch march;
+        for (int i = 0; i < samples; ++i) {
+            march.march(*medium_, along, random.uniform());
+            values.push_back(march.invert(random.uniform()));
+        }
+        const auto [mean, error] = test::estimate(values);
+        EXPECT_NEAR(mean, expected, 0.01 + test::z_limit(0.9999, tests()) * error) << "ray " << r;
+    }
+}
+
+}  // namespace
+}  // namespace pileus
