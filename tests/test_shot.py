@@ -166,3 +166,10 @@ def test_an_unwritable_output(shot_file: Path, tmp_path: Path) -> None:
     shot = load_shot(shot_file, [f"image.output={tmp_path}/file/a.####.exr"])
     with pytest.raises(InputError, match=r"image\.output: cannot write in .*file"):
         check_files(shot, "shot.json", [1])
+
+
+@pytest.mark.parametrize(
+    "example", sorted(Path(__file__).parents[1].glob("examples/*.toml")), ids=lambda path: path.stem
+)
+def test_each_example_is_a_shot(example: Path) -> None:
+    assert not load_shot(example).warnings()
