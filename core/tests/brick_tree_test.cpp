@@ -173,6 +173,24 @@ TEST(BrickTree, MajorantsAreTheGreatestVoxelSeen) {
     }
 }
 
+TEST(BrickTree, AVoxelOnTheCornerOfNodesIsSeenFromAllAround) {
+    // The cells below it lie in seven other nodes, which hold nothing of their own.
+    for (const int corner : {56, 120, 504, 4088}) {
+        const auto grid = empty_grid();
+        grid->tree().setValue(Coord(0), 0.5f);  // puts the tree's origin at -8
+        grid->tree().setValue(Coord(corner), 1.0f);
+        const BuiltTree built = build_brick_tree(grid->tree());
+        const V3i voxel = V3i(corner) - built.origin;
+        ASSERT_EQ(voxel.x % 64, 0);
+        Random random(1);
+        for (unsigned below = 0; below < 8; ++below) {
+            const V3i cell = voxel - V3i(below >> 2, below >> 1 & 1, below & 1);
+            EXPECT_EQ(built.tree.cells(cell).majorant, 1.0f) << below << " of " << corner;
+            expect_exact_majorant(built.tree, cell, random);
+        }
+    }
+}
+
 struct TileCase {
     const char* name;
     void (*fill)(FloatGrid&);
