@@ -74,6 +74,13 @@ void DirectLight::set_terms(int first, int last) {
 
 void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
                       PathRecord& record) {
+    // Light scattered often is smooth and faint: late orders ask for it less often, and count it
+    // for more.
+    const float chance = first < 4 ? 1.0f : first < 8 ? 0.5f : 0.25f;
+    if (random.stream(roulette_stream, static_cast<std::uint64_t>(first), 0).uniform() >= chance)
+        return;
+    const Color weight = event.weight / chance;
+
     set_terms(first, last);
     const HenyeyGreenstein& phase = scene_.medium.phase();
     const Lobe lobe(phase, last > 1);
@@ -101,7 +108,7 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
                 const float scattered = term.phase.density(event.direction, sample->direction);
                 record.add(
                     term.look, term.order,
-                    event.weight * sample->radiance *
+                    weight * sample->radiance *
                         (share * term.weight * scattered * shadow.transmittance(term.power)));
             }
         }
@@ -121,7 +128,7 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
             if (term.walk) continue;
             const float scattered = term.phase.density(event.direction, direction);
             record.add(term.look, term.order,
-                       event.weight * radiance *
+                       weight * radiance *
                            (term.weight * scattered * shadow.transmittance(term.power) / density));
         }
     }

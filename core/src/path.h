@@ -31,7 +31,7 @@ struct PathRandom {
     std::uint64_t key;
 };
 
-enum StreamPurpose : std::uint64_t { walk_stream, light_stream, lobe_stream };
+enum StreamPurpose : std::uint64_t { walk_stream, light_stream, lobe_stream, roulette_stream };
 
 /// What one path finds: by look, and by order where they are wanted apart.
 class PathRecord {
