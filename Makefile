@@ -15,12 +15,12 @@ JOBS := $(shell nproc)
 demo: setup
 	$(PYTHON) -m pileus_worker.demo
 
-test: setup build/.built
-	ctest --test-dir build --output-on-failure
+test: lint build/.built
+	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest
 
-test-slow: setup build/.built
-	ctest --test-dir build --output-on-failure
+test-slow: lint build/.built
+	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest -m ''
 
 lint: setup

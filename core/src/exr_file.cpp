@@ -163,6 +163,12 @@ ExrFile read_exr(const std::string& path) {
             if (names != channels || header.dataWindow() != data)
                 throw InputError("its parts differ in channels or size");
         }
+        // Deflate packs no tighter than this: a damaged header must not claim more memory.
+        constexpr std::uintmax_t tightest = 1032;
+        const std::uintmax_t least =
+            window.pixels() * channels.size() * looks.size() * sizeof(::half);
+        if (least / tightest > std::filesystem::file_size(path))
+            throw InputError("it is too short for its size");
         result.image = LayeredImage(window, looks, channels);
         for (int p = 0; p < file.parts(); ++p) {
             Imf::FrameBuffer buffer;

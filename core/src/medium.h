@@ -9,6 +9,8 @@
 #include "random.h"
 #include "volume.h"
 
+#include <algorithm>
+
 namespace pileus {
 
 class Medium {
@@ -25,13 +27,14 @@ class Medium {
             for (int column = 0; column < 3; ++column) {
                 to_local_[row][column] = static_cast<float>(m[row][column]);
             }
+            const V3d voxels(m[row][0], m[row][1], m[row][2]);  // along one unit of the world
+            thickest_ = std::max(thickest_, 1000.0f * static_cast<float>(voxels.length()));
         }
     }
 
     const Volume& volume() const { return *volume_; }
     const Color& albedo() const { return albedo_; }
     const HenyeyGreenstein& phase() const { return phase_; }
-    bool grey() const { return albedo_.x == albedo_.y && albedo_.y == albedo_.z; }
 
     /// A ray from a local position along a unit vector of the world.
     LocalRay ray(const V3f& local_position, const V3f& world_direction) const {
@@ -47,9 +50,9 @@ class Medium {
     }
 
     /// sigma_t at a local position inside the box: one interpolated voxel.
-    float extinction(const V3f& x) const { return extinction_ * tree_->interpolate(x); }
+    float extinction(const V3f& x) const { return bounded(tree_->interpolate(x)); }
     float extinction(const V3f& x, BrickTree::Cursor& cursor) const {
-        return extinction_ * tree_->interpolate(x, cursor);
+        return bounded(tree_->interpolate(x, cursor));
     }
 
     /// An unbiased estimate of sigma_t that reads a single voxel, never above the majorant.
@@ -58,18 +61,24 @@ class Medium {
         const auto jitter = [bits](int shift) {
             return static_cast<float>((bits >> shift) & 0x1fffff) * 0x1p-21f;
         };
-        return extinction_ * tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42)));
+        return bounded(tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42))));
     }
 
-    /// The stretches of a ray that may hold anything. Their majorants are of the density: times
-    /// `scale()` they are of sigma_t.
+    /// The stretches of a ray that may hold anything, with majorants of the density.
     MajorantIterator majorants(const LocalRay& ray) const { return {*tree_, ray}; }
-    float scale() const { return extinction_; }
+
+    /// The majorant of sigma_t where that of the density is given.
+    float majorant(float density) const { return bounded(density); }
 
   private:
+    /// sigma_t of a density. A thousand mean free paths a voxel are as good as any more, and keep
+    /// the work along a ray, and its steps in float, bounded.
+    float bounded(float density) const { return std::min(extinction_ * density, thickest_); }
+
     const Volume* volume_;
     const BrickTree* tree_;
     float extinction_;
+    float thickest_ = 0.0f;
     Color albedo_;
     HenyeyGreenstein phase_;
     Imath::M33f to_local_;

@@ -4,6 +4,7 @@
 
 #include "medium.h"
 
+#include <cmath>
 #include <optional>
 
 namespace pileus {
@@ -19,7 +20,7 @@ bool track(const Medium& medium, const LocalRay& ray, float rate, float first_fl
     MajorantSegment segment;
     float flight = first_flight;
     while (majorants.next(segment)) {
-        const float majorant = segment.majorant * medium.scale();
+        const float majorant = medium.majorant(segment.majorant);
         const float frequency = rate * majorant;
         if (frequency == 0.0f) continue;  // without extinction, or with less than a float can hold
         float t = segment.begin;
@@ -30,7 +31,8 @@ bool track(const Medium& medium, const LocalRay& ray, float rate, float first_fl
                 flight = std::max(flight, 0.0f);
                 break;
             }
-            t += step;
+            // Far out on a ray a step may be too short for a float to tell.
+            t = t + step > t ? t + step : std::nextafter(t, segment.end);
             if (visit(t, majorant)) return true;
             flight = random.exponential();
         }

@@ -103,7 +103,7 @@ INSTANTIATE_TEST_SUITE_P(
     Oracle, SlabTest,
     testing::Values(Slab{"Forward", 2.0f, 0.9f, 0.75f, 0.09746, 0.66090, 7e-5, 128},
                     Slab{"Isotropic", 2.0f, 1.0f, 0.0f, 0.51765, 1.0 - 0.51765, 2e-4, 96},
-                    Slab{"Thick", 16.0f, 1.0f, 0.85f, 0.55645, 1.0 - 0.55645, 4e-4, 40}),
+                    Slab{"Thick", 16.0f, 1.0f, 0.85f, 0.55645, 1.0 - 0.55645, 4e-4, 64}),
     [](const auto& info) { return info.param.name; });
 
 /// A homogeneous cube of side 1 and optical thickness `extinction`, filling most of the view.
@@ -124,6 +124,20 @@ TEST(WhiteFurnace, ReferenceIsOneAtEveryPixel) {
         for (std::size_t i = 0; i < 256; ++i) {
             ASSERT_FLOAT_EQ(partial.image.plane(0, Partial::r)[i], 1.0f) << i;
         }
+    }
+}
+
+TEST(WhiteFurnace, HoldsWhereNoLightPassesAVoxel) {
+    // The work along a ray is bounded however thick the medium: without that, this has no end.
+    for (const char* method : {"multiple", "reference"}) {
+        const Scene scene = cube(1e9f, Color(0.5f), 0.0f, {test::constant_dome()}, 8);
+        const Partial partial = test::render_whole(scene, test::transport_of(method, 4), 4);
+        for (std::size_t i = 0; i < 64; ++i) {
+            const float radiance = partial.image.plane(0, Partial::r)[i];
+            const float opacity = partial.image.plane(0, Partial::a)[i];
+            EXPECT_TRUE(opacity == 0.0f ? radiance == 1.0f : radiance >= 0.0f && radiance < 1.5f);
+        }
+        EXPECT_EQ(partial.image.plane(0, Partial::a)[27], 1.0f);
     }
 }
 

@@ -41,7 +41,7 @@ class TrackingTest : public testing::Test {
     }
 
     double depth(const LocalRay& r, double end, double begin = 0.0) const {
-        return medium_->scale() *
+        return medium_->majorant(1.0f) *
                test::optical_depth(volume_->tree(), V3d(r.origin), V3d(r.direction), begin, end);
     }
 
@@ -165,7 +165,7 @@ TEST_F(TrackingTest, TheMarchInvertsItsOwnOpacity) {
             // Steps are at most a voxel long, and the field changes by less than one over a voxel:
             // the depth up to t is the march's own up to that.
             const double expected = -std::log1p(-double(u * march.opacity()));
-            ASSERT_NEAR(depth(along, t), expected, 0.25 * medium_->scale() * 0.1 * 4.0);
+            ASSERT_NEAR(depth(along, t), expected, 0.25 * medium_->majorant(1.0f) * 0.1 * 4.0);
         }
         EXPECT_LT(march.invert(std::nextafter(1.0f, 0.0f)), everything);
     }

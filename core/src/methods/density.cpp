@@ -28,6 +28,7 @@ class Density final : public Method {
             if (march_.opacity() <= 0.0f) return;
             event->position = ray_on.at(march_.invert(walk.uniform()));
             event->weight *= medium.albedo() * march_.opacity();
+            if (event->weight == Color(0.0f)) return;
         }
     }
 

@@ -50,6 +50,7 @@ class Multiple final : public Method {
             }
             event->position = step.origin;
             event->weight *= medium.albedo();
+            if (event->weight == Color(0.0f)) return;
         }
     }
 
