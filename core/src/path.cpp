@@ -74,12 +74,15 @@ void DirectLight::set_terms(int first, int last) {
 
 void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
                       PathRecord& record) {
-    // Light scattered often is smooth and faint: late orders ask for it less often, and count it
-    // for more.
-    const float chance = first < 4 ? 1.0f : first < 8 ? 0.5f : 0.25f;
-    if (random.stream(roulette_stream, static_cast<std::uint64_t>(first), 0).uniform() >= chance)
-        return;
-    const Color weight = event.weight / chance;
+    // After the first event light is asked for with a chance that grows with what the phase
+    // function lets through: most directions lie far off its peak. b has no say, so that it can be
+    // regraded.
+    const float roulette =
+        first == 0 ? 0.0f
+                   : random.stream(roulette_stream, static_cast<std::uint64_t>(first), 0).uniform();
+    const auto chance = [&](float scattered) {
+        return first == 0 ? 1.0f : std::min(1.0f, 4.0f * scattered);
+    };
 
     set_terms(first, last);
     const HenyeyGreenstein& phase = scene_.medium.phase();
@@ -105,11 +108,14 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
                 const float rival = term.walk ? walk_density : lobe_density;
                 const float share =
                     rival > 0.0f ? sample->density / (sample->density + rival) : 1.0f;
-                const float scattered = term.phase.density(event.direction, sample->direction);
+                const float scattered =
+                    share * term.phase.density(event.direction, sample->direction);
+                const float asked = chance(4.0f * pi * scattered);
+                if (roulette >= asked) continue;
                 record.add(
                     term.look, term.order,
-                    weight * sample->radiance *
-                        (share * term.weight * scattered * shadow.transmittance(term.power)));
+                    event.weight * sample->radiance *
+                        (term.weight * scattered / asked * shadow.transmittance(term.power)));
             }
         }
         // ... and the phase function's, weighed against each other by the balance heuristic (Veach
@@ -126,10 +132,12 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         Shadow shadow(scene_.medium, event.position, direction, lobe_random);
         for (const Term& term : terms_) {
             if (term.walk) continue;
-            const float scattered = term.phase.density(event.direction, direction);
+            const float scattered = term.phase.density(event.direction, direction) / density;
+            const float asked = chance(scattered);
+            if (roulette >= asked) continue;
             record.add(term.look, term.order,
-                       weight * radiance *
-                           (term.weight * scattered * shadow.transmittance(term.power) / density));
+                       event.weight * radiance *
+                           (term.weight * scattered / asked * shadow.transmittance(term.power)));
         }
     }
 }
