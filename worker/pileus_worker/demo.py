@@ -40,7 +40,7 @@ def shot(name: str, *settings: str) -> Shot:
             f"name={name}",
             f"frames='{FRAMES}'",
             "image.width=640",
-            "sampling.samples=12",
+            "sampling.samples=8",
             "image.height=360",
             f"image.output='{FOLDER}/frames/{name}.####.exr'",
             f"volumes.0.cache='{FOLDER}/caches/cumulus.####.vdb'",
@@ -57,7 +57,7 @@ def run() -> None:
         label: shot(
             method,
             f"frames={STILL}",
-            "sampling.samples=24",
+            "sampling.samples=16",
             f"transport.method={method}",
             f"transport.max_bounces={bounces}",
         )
