@@ -5,7 +5,7 @@ PYTHON := $(VENV)/bin/python
 PIP := $(VENV)/bin/pip install --quiet --disable-pip-version-check
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 DEBIAN := redis-server cmake ninja-build g++ ccache libopenvdb-dev libboost-dev libboost-iostreams-dev \
-	libimath-dev libopenexr-dev libopenimageio-dev libtbb-dev libgtest-dev libbenchmark-dev \
+	libimath-dev libopenexr-dev libopenimageio-dev libtbb-dev libgtest-dev \
 	clang-format pkg-config python3-venv python3-dev
 CORE := $(shell find core -type f -not -path '*/build/*' -not -name '*.pyc')
 JOBS := $(shell nproc)

@@ -20,7 +20,7 @@ class Method {
     virtual void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) = 0;
 };
 
-/// The names a transport may have, in the order of DESIGN's table.
+/// The names a transport may have, in the order of the table in docs/methods.md.
 std::vector<std::string> method_names();
 
 /// The transport with its method's own number of bounces where none was asked for. Throws
