@@ -64,6 +64,7 @@ class BrickTree {
         V3i low;
         int size;
         float majorant;
+        const Node* lowest;  // the node of the bricks here; null where the cells are a coarser box
     };
 
     BrickTree() = default;
@@ -92,9 +93,7 @@ class BrickTree {
     /// The value at integer coordinates.
     float voxel(const V3i& at) const {
         if (!contains(at)) return 0.0f;
-        const Child found = descend(at);
-        return scale_ * decode_half(found & constant_bit ? static_cast<Half>(found)
-                                                         : bricks_[found][entry(at, 0)]);
+        return value(descend(at), at);
     }
 
     /// The brick or constant that was read last: points that follow each other mostly share it.
@@ -111,10 +110,14 @@ class BrickTree {
     }
 
     /// The value of one of the eight voxels around x, drawn with its interpolation weight: its mean
-    /// is the interpolated field. The three jitters are uniform in [0, 1).
-    float tap(const V3f& x, const V3f& jitter) const {
-        return voxel(
-            V3i(floor_int(x.x + jitter.x), floor_int(x.y + jitter.y), floor_int(x.z + jitter.z)));
+    /// is the interpolated field. The three jitters are uniform in [0, 1); x lies inside the root,
+    /// mostly in the brick of `near`.
+    float tap(const V3f& x, const V3f& jitter, const Cursor& near) const {
+        const V3i at(static_cast<int>(x.x + jitter.x), static_cast<int>(x.y + jitter.y),
+                     static_cast<int>(x.z + jitter.z));
+        const V3i from(at.x ^ near.low.x, at.y ^ near.low.y, at.z ^ near.low.z);
+        if ((from.x | from.y | from.z) & ~(width - 1)) return voxel(at);
+        return value(near.found, at);
     }
 
     /// The cells around one cell inside the root, with the majorant of the field over them.
@@ -128,10 +131,20 @@ class BrickTree {
             if (level == 1 || majorant == 0 || (child & constant_bit)) {
                 const int mask = ~((1 << shift) - 1);
                 return {V3i(cell.x & mask, cell.y & mask, cell.z & mask), 1 << shift,
-                        scale_ * decode_half(majorant)};
+                        scale_ * decode_half(majorant), level == 1 ? node : nullptr};
             }
             node = &nodes_[child];
         }
+    }
+
+    /// The majorant over the cells of a brick, by one of the node's own voxels in it.
+    float majorant(const Node& lowest, const V3i& cell) const {
+        return scale_ * decode_half(lowest.max[entry(cell, log2_width)]);
+    }
+
+    /// The brick or constant at one of a lowest node's own voxels.
+    static Child child(const Node& lowest, const V3i& cell) {
+        return lowest.child[entry(cell, log2_width)];
     }
 
     static int floor_int(float x) {
@@ -147,6 +160,11 @@ class BrickTree {
         return static_cast<unsigned>((((at.x >> shift) & mask) << (2 * log2_width)) |
                                      (((at.y >> shift) & mask) << log2_width) |
                                      ((at.z >> shift) & mask));
+    }
+
+    float value(Child found, const V3i& at) const {
+        return scale_ * decode_half(found & constant_bit ? static_cast<Half>(found)
+                                                         : bricks_[found][entry(at, 0)]);
     }
 
     /// The brick or constant that holds a voxel inside the root.

@@ -34,7 +34,7 @@ inline V3f direction_about(const V3f& w, float one_minus_cos, float phi) {
     const float sine = std::sqrt(std::max(0.0f, one_minus_cos * (2.0f - one_minus_cos)));
     const V3f d =
         w * (1.0f - one_minus_cos) + u * (sine * std::cos(phi)) + v * (sine * std::sin(phi));
-    return d.normalized();
+    return d * (1.0f / d.length());
 }
 
 inline float luminance(const Color& c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }

@@ -55,13 +55,14 @@ class Medium {
         return bounded(tree_->interpolate(x, cursor));
     }
 
-    /// An unbiased estimate of sigma_t that reads a single voxel, never above the majorant.
-    float extinction_tap(const V3f& x, Random& random) const {
+    /// An unbiased estimate of sigma_t at a position of a segment, which reads a single voxel and
+    /// is never above the segment's majorant.
+    float extinction_tap(const V3f& x, const MajorantSegment& segment, Random& random) const {
         const std::uint64_t bits = random.bits();
         const auto jitter = [bits](int shift) {
             return static_cast<float>((bits >> shift) & 0x1fffff) * 0x1p-21f;
         };
-        return bounded(tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42))));
+        return bounded(tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42)), segment.brick));
     }
 
     /// The stretches of a ray that may hold anything, with majorants of the density.

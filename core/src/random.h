@@ -91,17 +91,36 @@ constexpr std::uint32_t owen_scramble(std::uint32_t x, std::uint32_t seed) {
     return reverse_bits(x);
 }
 
+/// The sum of direction numbers for each value of each byte of an index: a point takes four
+/// look-ups a dimension.
+using ByteTable = std::array<std::array<std::array<std::uint32_t, dimensions>, 256>, 4>;
+
+constexpr ByteTable byte_table() {
+    constexpr auto directions = direction_numbers();
+    ByteTable table{};
+    for (unsigned byte = 0; byte < 4; ++byte) {
+        for (unsigned value = 1; value < 256; ++value) {
+            const auto lowest = static_cast<unsigned>(std::countr_zero(value));
+            for (unsigned d = 0; d < dimensions; ++d) {
+                table[byte][value][d] =
+                    table[byte][value & (value - 1)][d] ^ directions[d][8 * byte + lowest];
+            }
+        }
+    }
+    return table;
+}
+
 /// Point `index` of the sequence that `key` names: four scrambled coordinates in [0, 1). Sequences
 /// with different keys are shuffled against each other, so that they may be padded into higher
 /// dimensions.
 inline std::array<float, dimensions> point(std::uint32_t index, std::uint64_t key) {
-    static constexpr auto directions = direction_numbers();
+    static constexpr ByteTable table = byte_table();
     const std::uint32_t shuffled = owen_scramble(index, static_cast<std::uint32_t>(mix64(key)));
     std::array<float, dimensions> result{};
     for (unsigned d = 0; d < dimensions; ++d) {
         std::uint32_t x = 0;
-        for (std::uint32_t rest = shuffled; rest != 0; rest &= rest - 1) {
-            x ^= directions[d][static_cast<unsigned>(std::countr_zero(rest))];
+        for (unsigned byte = 0; byte < 4; ++byte) {
+            x ^= table[byte][(shuffled >> (8 * byte)) & 0xffu][d];
         }
         const auto seed = static_cast<std::uint32_t>(hash_key(key, d + 1) >> 32);
         result[d] = unit_float(owen_scramble(x, seed));

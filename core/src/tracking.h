@@ -9,10 +9,10 @@
 
 namespace pileus {
 
-/// Calls visit(t, majorant of sigma_t) at each tentative collision along the ray, until it returns
-/// true or the ray has left the medium. Collisions come at `rate` times the majorant. The first
-/// free flight is given as an optical depth, so that the caller may stratify it. Returns whether a
-/// visit ended the ray.
+/// Calls visit(t, segment, majorant of sigma_t) at each tentative collision along the ray, until it
+/// returns true or the ray has left the medium. Collisions come at `rate` times the majorant. The
+/// first free flight is given as an optical depth, so that the caller may stratify it. Returns
+/// whether a visit ended the ray.
 template <class Visit>
 bool track(const Medium& medium, const LocalRay& ray, float rate, float first_flight,
            Random& random, Visit&& visit) {
@@ -33,7 +33,7 @@ bool track(const Medium& medium, const LocalRay& ray, float rate, float first_fl
             }
             // Far out on a ray a step may be too short for a float to tell.
             t = t + step > t ? t + step : std::nextafter(t, segment.end);
-            if (visit(t, majorant)) return true;
+            if (visit(t, segment, majorant)) return true;
             flight = random.exponential();
         }
     }
@@ -45,11 +45,12 @@ bool track(const Medium& medium, const LocalRay& ray, float rate, float first_fl
 inline std::optional<float> delta_track(const Medium& medium, const LocalRay& ray,
                                         float first_flight, Random& random) {
     float distance = 0.0f;
-    const bool collided =
-        track(medium, ray, 1.0f, first_flight, random, [&](float t, float majorant) {
-            distance = t;
-            return random.uniform() * majorant < medium.extinction_tap(ray.at(t), random);
-        });
+    const bool collided = track(medium, ray, 1.0f, first_flight, random,
+                                [&](float t, const MajorantSegment& segment, float majorant) {
+                                    distance = t;
+                                    return random.uniform() * majorant <
+                                           medium.extinction_tap(ray.at(t), segment, random);
+                                });
     return collided ? std::optional(distance) : std::nullopt;
 }
 
@@ -61,12 +62,13 @@ inline float ratio_track(const Medium& medium, const LocalRay& ray, float power,
     constexpr float small = 0.1f;
     if (power == 0.0f) return 1.0f;
     float transmittance = 1.0f;
-    track(medium, ray, power, random.exponential(), random, [&](float t, float majorant) {
-        transmittance *= 1.0f - medium.extinction_tap(ray.at(t), random) / majorant;
-        if (transmittance >= small) return false;
-        transmittance = random.uniform() * small < transmittance ? small : 0.0f;
-        return transmittance == 0.0f;
-    });
+    track(medium, ray, power, random.exponential(), random,
+          [&](float t, const MajorantSegment& segment, float majorant) {
+              transmittance *= 1.0f - medium.extinction_tap(ray.at(t), segment, random) / majorant;
+              if (transmittance >= small) return false;
+              transmittance = random.uniform() * small < transmittance ? small : 0.0f;
+              return transmittance == 0.0f;
+          });
     return transmittance;
 }
 

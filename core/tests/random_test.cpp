@@ -70,7 +70,7 @@ void expect_uniform_square(const std::vector<std::pair<float, float>>& pairs, in
 
 TEST(RandomStreams, OfNeighbouringKeysAreIndependent) {
     constexpr int pairs = 200000;
-    // Whatever names a stream: the pixel, the sample, the purpose, the order, the light.
+    // Whatever names a stream: the pixel, the sample, the purpose, the order.
     using Pair = std::pair<Random, Random>;
     const std::uint64_t pixel = hash_key(hash_key(1, 2), 3);
     const PathRandom path(pixel, 0), next_sample(pixel, 1),
@@ -79,9 +79,9 @@ TEST(RandomStreams, OfNeighbouringKeysAreIndependent) {
         Pair(path.stream(walk_stream), next_sample.stream(walk_stream)),
         Pair(path.stream(walk_stream), next_pixel.stream(walk_stream)),
         Pair(path.stream(walk_stream), path.stream(light_stream)),
-        Pair(path.stream(light_stream, 0, 0), path.stream(lobe_stream, 0, 0)),
-        Pair(path.stream(light_stream, 0, 1), path.stream(light_stream, 1, 0)),
-        Pair(path.stream(light_stream, 0, 0), path.stream(light_stream, 1, 0)),
+        Pair(path.stream(light_stream, 0), path.stream(bridge_stream, 0)),
+        Pair(path.stream(light_stream, 1), path.stream(walk_stream, 1)),
+        Pair(path.stream(light_stream, 0), path.stream(light_stream, 1)),
     };
     for (auto [a, b] : neighbours) {
         std::vector<std::pair<float, float>> values;
