@@ -2,6 +2,7 @@
 
 #include "tracking.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace pileus {
@@ -51,10 +52,19 @@ class Shadow {
     float power_ = 0.0f, transmittance_ = 1.0f;
 };
 
+/// The chance with which light is asked for that would count `brightness` times as much as it does
+/// under an isotropic phase function: most directions lie far off the phase function's peak. b has
+/// no say, so that it can be regraded.
+float chance(float brightness) { return std::min(1.0f, brightness); }
+
 }  // namespace
 
-DirectLight::DirectLight(const Scene& scene, const std::vector<Look>& looks, Sky sky)
-    : scene_(scene), looks_(looks), sky_(sky) {}
+DirectLight::DirectLight(const Scene& scene, const std::vector<Look>& looks, Flights flights)
+    : scene_(scene),
+      looks_(looks),
+      tracked_(flights == Flights::tracked),
+      all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
+                                        [](const Look& look) { return look.physical(); })) {}
 
 void DirectLight::set_terms(int first, int last) {
     if (first == first_ && last == last_) return;
@@ -64,88 +74,144 @@ void DirectLight::set_terms(int first, int last) {
     for (std::size_t k = 0; k < looks_.size(); ++k) {
         for (int i = first; i < last; ++i) {
             const Look& look = looks_[k];
-            const auto power = [i](float base) { return std::pow(base, static_cast<float>(i)); };
+            const auto power = [i](float base) {
+                return base == 1.0f ? 1.0f : std::pow(base, static_cast<float>(i));
+            };
             terms_.push_back({k, i, power(look.b),
                               HenyeyGreenstein(power(look.c) * scene_.medium.phase().g()),
-                              power(look.a), sky_ == Sky::walk && look.physical()});
+                              power(look.a), tracked_ && look.physical()});
         }
     }
 }
 
 void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
                       PathRecord& record) {
-    // After the first event light is asked for with a chance that grows with what the phase
-    // function lets through: most directions lie far off its peak. b has no say, so that it can be
-    // regraded.
-    const float roulette =
-        first == 0 ? 0.0f
-                   : random.stream(roulette_stream, static_cast<std::uint64_t>(first), 0).uniform();
-    const auto chance = [&](float scattered) {
-        return first == 0 ? 1.0f : std::min(1.0f, 4.0f * scattered);
-    };
-
     set_terms(first, last);
     const HenyeyGreenstein& phase = scene_.medium.phase();
     const Lobe lobe(phase, last > 1);
-    bool all_walk = true;
-    for (const Term& term : terms_) all_walk &= term.walk;
+    Random event_stream = random.stream(light_stream, static_cast<std::uint64_t>(first));
+    const float roulette = first == 0 ? 0.0f : event_stream.uniform();
+    const auto asked = [&](float brightness) { return first == 0 ? 1.0f : chance(brightness); };
 
-    for (std::size_t l = 0; l < scene_.lights.size(); ++l) {
-        const Light& light = *scene_.lights[l];
-        const auto order = static_cast<std::uint64_t>(first);
+    for (const auto& light : scene_.lights) {
+        Random stream(event_stream.bits());
+        const bool hit = light->can_be_hit();
         // The light's own directions ...
-        Random stream = random.stream(light_stream, order, l);
-        const float u1 = first == 0 ? random.second[0] : stream.uniform();
-        const float u2 = first == 0 ? random.second[1] : stream.uniform();
-        if (const auto sample = light.sample(u1, u2)) {
-            const bool hit = light.can_be_hit();
+        const float u1 = first == 0 ? random.second()[0] : stream.uniform();
+        const float u2 = first == 0 ? random.second()[1] : stream.uniform();
+        if (const auto sample = light->sample(u1, u2)) {
+            const float seen = phase.density(event.direction, sample->direction);
             const float lobe_density =
                 hit ? lobe.density(event.direction, sample->direction) : 0.0f;
-            const float walk_density =
-                hit ? phase.density(event.direction, sample->direction) : 0.0f;
+            float others = 0.0f;  // the inverse densities that the bridges weigh in
+            if (tracked_ && !hit) {
+                for (const float inverse : event.inverse_density) others += inverse;
+            }
             Shadow shadow(scene_.medium, event.position, sample->direction, stream);
             for (const Term& term : terms_) {
-                const float rival = term.walk ? walk_density : lobe_density;
-                const float share =
-                    rival > 0.0f ? sample->density / (sample->density + rival) : 1.0f;
+                const float rival = hit ? (term.walk ? seen : lobe_density) : 0.0f;
+                const float share = rival > 0.0f ? sample->density / (sample->density + rival)
+                                                 : 1.0f / (1.0f + seen * others);
                 const float scattered =
                     share * term.phase.density(event.direction, sample->direction);
-                const float asked = chance(4.0f * pi * scattered);
-                if (roulette >= asked) continue;
-                record.add(
-                    term.look, term.order,
-                    event.weight * sample->radiance *
-                        (term.weight * scattered / asked * shadow.transmittance(term.power)));
+                const float odds = asked(4.0f * pi * scattered);
+                if (roulette >= odds) continue;
+                record.add(term.look, term.order,
+                           event.weight * sample->radiance *
+                               (term.weight * scattered / odds * shadow.transmittance(term.power)));
             }
         }
         // ... and the phase function's, weighed against each other by the balance heuristic (Veach
         // 1997).
-        if (!light.can_be_hit() || all_walk) continue;
-        Random lobe_random = random.stream(lobe_stream, order, l);
-        const float choice = first == 0 ? random.first[3] : lobe_random.uniform();
-        const float v1 = first == 0 ? random.second[0] : lobe_random.uniform();
-        const float v2 = first == 0 ? random.second[1] : lobe_random.uniform();
+        if (!hit || all_walk_) continue;
+        Random lobe_stream(stream.bits());
+        const float choice = first == 0 ? random.first[3] : lobe_stream.uniform();
+        const float v1 = first == 0 ? random.second()[0] : lobe_stream.uniform();
+        const float v2 = first == 0 ? random.second()[1] : lobe_stream.uniform();
         const V3f direction = lobe.sample(event.direction, choice, v1, v2);
-        const float density = lobe.density(event.direction, direction) + light.density(direction);
-        const Color radiance = light.radiance(direction);
+        const float density = lobe.density(event.direction, direction) + light->density(direction);
+        const Color radiance = light->radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        Shadow shadow(scene_.medium, event.position, direction, lobe_random);
+        Shadow shadow(scene_.medium, event.position, direction, lobe_stream);
         for (const Term& term : terms_) {
             if (term.walk) continue;
             const float scattered = term.phase.density(event.direction, direction) / density;
-            const float asked = chance(scattered);
-            if (roulette >= asked) continue;
+            const float odds = asked(scattered);
+            if (roulette >= odds) continue;
             record.add(term.look, term.order,
                        event.weight * radiance *
-                           (term.weight * scattered / asked * shadow.transmittance(term.power)));
+                           (term.weight * scattered / odds * shadow.transmittance(term.power)));
         }
     }
 }
 
-void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, int order,
-                             PathRecord& record) const {
-    if (sky_ != Sky::walk) return;
-    const float density = scene_.medium.phase().density(event.direction, direction);
+void DirectLight::add_bridges(const ScatterEvent& event, int order, int end,
+                              const PathRandom& random, PathRecord& record) {
+    const Medium& medium = scene_.medium;
+    const HenyeyGreenstein& phase = medium.phase();
+    Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(order));
+    for (const auto& light : scene_.lights) {
+        if (light->can_be_hit()) continue;
+        Random stream(event_stream.bits());
+        const float u1 = stream.uniform(), u2 = stream.uniform();
+        const auto sample = light->sample(u1, u2);
+        if (!sample) continue;
+        // A chain of directions that grows from the light towards the event, by one for each
+        // length; and the inverse densities of all choices of which a bridge leaves one to be
+        // evaluated.
+        std::array<V3f, longest_bridge> chain;
+        V3f next = sample->direction;
+        float chain_inverse = 0.0f, last_density = 0.0f;
+        const int most = std::min(longest_bridge, end - 1 - order);
+        for (int length = 1; length <= most; ++length) {
+            const float v1 = stream.uniform(), v2 = stream.uniform();
+            const V3f direction = phase.sample(next, v1, v2);
+            const float density = phase.density(direction, next);
+            if (length == 1) last_density = density;
+            chain[static_cast<std::size_t>(length - 1)] = next = direction;
+            chain_inverse += 1.0f / density;
+            float inverse = chain_inverse + 1.0f / phase.density(event.direction, direction);
+            for (int i = 0; i < longest_bridge - length; ++i)
+                inverse += event.inverse_density[static_cast<std::size_t>(i)];
+            const float odds = chance(4.0f * pi / inverse);
+            Random own(stream.bits());
+            if (own.uniform() >= odds) continue;
+            if (const auto arrival =
+                    fly(event, {chain.data(), static_cast<std::size_t>(length)}, own)) {
+                set_terms(order + length, order + length + 1);
+                Shadow shadow(medium, arrival->position, sample->direction, own);
+                for (const Term& term : terms_) {
+                    const float scattered =
+                        term.phase.density(chain[0], sample->direction) / (last_density * inverse);
+                    record.add(
+                        term.look, term.order,
+                        arrival->weight * sample->radiance *
+                            (term.weight * scattered / odds * shadow.transmittance(term.power)));
+                }
+            }
+        }
+    }
+}
+
+/// Where a path comes to that flies on from an event along the directions of a chain, its last
+/// first; nothing if it leaves the medium on its way.
+std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, std::span<const V3f> chain,
+                                             Random& random) const {
+    const Medium& medium = scene_.medium;
+    ScatterEvent event = from;
+    for (auto direction = chain.rbegin(); direction != chain.rend(); ++direction) {
+        const LocalRay flight = medium.ray(event.position, *direction);
+        const auto distance = delta_track(medium, flight, random.exponential(), random);
+        if (!distance) return std::nullopt;
+        event.position = flight.at(*distance);
+        event.weight *= medium.albedo();
+    }
+    return event;
+}
+
+void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float density,
+                             int order, PathRecord& record) const {
+    if (!tracked_) return;
     for (const auto& light : scene_.lights) {
         if (!light->can_be_hit()) continue;
         const float share = density / (density + light->density(direction));

@@ -7,31 +7,43 @@
 
 #include <array>
 #include <cstdint>
+#include <optional>
+#include <span>
 #include <vector>
 
 namespace pileus {
 
+enum StreamPurpose : std::uint64_t { walk_stream, light_stream, bridge_stream, stream_purposes };
+
 /// The random numbers of one path: stratified ones for its first dimensions, and independent
 /// streams named by what they are for, so that no part of a path can shift the numbers of another.
-struct PathRandom {
+class PathRandom {
+  public:
     PathRandom(std::uint64_t pixel_key, std::uint32_t sample)
         : first(sobol::point(sample, hash_key(pixel_key, 0))),
-          second(sobol::point(sample, hash_key(pixel_key, 1))),
-          key(hash_key(pixel_key, sample + 2ULL)) {}
-
-    Random stream(std::uint64_t purpose) const { return Random(hash_key(key, purpose)); }
-    Random stream(std::uint64_t purpose, std::uint64_t a, std::uint64_t b) const {
-        return Random(hash_key(hash_key(hash_key(key, purpose), a), b));
-    }
+          pixel_key_(pixel_key),
+          sample_(sample),
+          key_(hash_key(pixel_key, sample + 2ULL)) {}
 
     // The pixel's x and y, the distance to the first event, and there the choice of lobe.
     std::array<float, sobol::dimensions> first;
-    // At the first event: the direction towards a light, and the walk's.
-    std::array<float, sobol::dimensions> second;
-    std::uint64_t key;
-};
 
-enum StreamPurpose : std::uint64_t { walk_stream, light_stream, lobe_stream, roulette_stream };
+    /// At the first event: the direction towards a light, and the walk's. Many paths have none.
+    const std::array<float, sobol::dimensions>& second() const {
+        if (!second_) second_ = sobol::point(sample_, hash_key(pixel_key_, 1));
+        return *second_;
+    }
+
+    Random stream(StreamPurpose purpose, std::uint64_t index = 0) const {
+        return Random(hash_key(key_, index * stream_purposes + purpose));
+    }
+
+  private:
+    std::uint64_t pixel_key_;
+    std::uint32_t sample_;
+    std::uint64_t key_;
+    mutable std::optional<std::array<float, sobol::dimensions>> second_;
+};
 
 /// What one path finds: by look, and by order where they are wanted apart.
 class PathRecord {
@@ -67,34 +79,54 @@ class PathRecord {
     std::vector<Color> radiance_;
 };
 
+/// How many events a bridge to a distant light may have of its own.
+constexpr int longest_bridge = 2;
+
 /// A scatter event: light that travels the path backwards comes along `direction`.
 struct ScatterEvent {
     V3f position;   // local
     V3f direction;  // world, unit: the way the walk arrived
     Color weight;   // of the path up to here, this event's albedo included
+    // 1 / density of the choices of the last directions, this one's first; 0 where there was none.
+    std::array<float, longest_bridge> inverse_density{};
 };
 
-/// How the sky reaches a physical look (a = b = c = 1).
-enum class Sky {
-    shadow_rays,  // like any light
-    walk  // by the walk itself as it leaves the medium, at no cost: only where its flights are
-          // unbiased
+/// How a method flies from event to event.
+enum class Flights {
+    tracked,  // delta tracking, unbiased
+    other
 };
 
 /// Adds the direct light at an event, Eq. 1 for the orders [first, last), to every look: for each
 /// light
 ///   sigma_s b^i L p(w_i, w_o, c^i g) exp(-a^i integral of sigma_t to the light).
 /// Looks share the directions, and the shadow rays where they share the power a^i.
+///
+/// Where flights are tracked, two more techniques find the same light with less noise:
+/// - the sky reaches a physical look (a = b = c = 1) by the walk itself as it leaves the medium, at
+///   no cost (`add_escape`);
+/// - distant lights, which the narrow lobe of one event sees seldom and then brightly, are also
+///   reached by bridges (`add_bridges`): the last one or two directions of a path are drawn from
+///   the light's end, each about the one that follows it, rather than about the one before. Of the
+///   path's last three phase functions p one is then evaluated and the others sampled. Weighed by
+///   the balance heuristic (Veach 1997) every technique counts the same, the harmonic sum
+///   1 / (sum of 1 / p): it has a peak only where all of them do.
 class DirectLight {
   public:
-    DirectLight(const Scene& scene, const std::vector<Look>& looks, Sky sky);
+    DirectLight(const Scene& scene, const std::vector<Look>& looks, Flights flights);
 
     void add(const ScatterEvent& event, int first, int last, const PathRandom& random,
              PathRecord& record);
 
-    /// Adds what a walk that has left the medium sees of the sky, for the looks whose `Sky` is the
-    /// walk: it scattered into `direction` at `event`, of the given order, and met nothing more.
-    void add_escape(const ScatterEvent& event, const V3f& direction, int order,
+    /// Adds light of the orders after `order`, below `end`, by way of further events between this
+    /// one and each distant light.
+    void add_bridges(const ScatterEvent& event, int order, int end, const PathRandom& random,
+                     PathRecord& record);
+
+    /// Adds what a walk that has left the medium sees of the sky, for the physical looks: it
+    /// scattered into `direction` at `event`, of the given order, with that phase density, and met
+    /// nothing more.
+    void add_escape(const ScatterEvent& event, const V3f& direction, float density, int order,
                     PathRecord& record) const;
 
   private:
@@ -108,10 +140,13 @@ class DirectLight {
     };
 
     void set_terms(int first, int last);
+    std::optional<ScatterEvent> fly(const ScatterEvent& from, std::span<const V3f> chain,
+                                    Random& random) const;
 
     const Scene& scene_;
     const std::vector<Look>& looks_;
-    Sky sky_;
+    bool tracked_;
+    bool all_walk_;
     int first_ = -1, last_ = -1;
     std::vector<Term> terms_;
 };

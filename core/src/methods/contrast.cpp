@@ -13,7 +13,7 @@ class Contrast final : public Method {
     Contrast(const Scene& scene, const Transport& transport)
         : scene_(scene),
           octaves_(*transport.max_bounces),
-          light_(scene, transport.looks, Sky::shadow_rays) {}
+          light_(scene, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         Random walk = random.stream(walk_stream);

@@ -12,7 +12,7 @@ class Density final : public Method {
     Density(const Scene& scene, const Transport& transport)
         : scene_(scene),
           orders_(*transport.max_bounces),
-          light_(scene, transport.looks, Sky::shadow_rays) {}
+          light_(scene, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;

@@ -22,7 +22,7 @@ class Multiple final : public Method {
     Multiple(const Scene& scene, const Transport& transport)
         : scene_(scene),
           orders_(*transport.max_bounces),
-          light_(scene, transport.looks, Sky::shadow_rays) {}
+          light_(scene, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
@@ -33,8 +33,8 @@ class Multiple final : public Method {
         for (int order = 0;; ++order) {
             light_.add(*event, order, order + 1, random, record);
             if (order + 1 == orders_) return;
-            const float u1 = order == 0 ? random.second[2] : walk.uniform();
-            const float u2 = order == 0 ? random.second[3] : walk.uniform();
+            const float u1 = order == 0 ? random.second()[2] : walk.uniform();
+            const float u2 = order == 0 ? random.second()[3] : walk.uniform();
             event->direction = medium.phase().sample(event->direction, u1, u2);
             LocalRay step = medium.ray(event->position, event->direction);
             if (local > 0.0f) {

@@ -15,7 +15,7 @@ class Reference final : public Method {
     Reference(const Scene& scene, const Transport& transport)
         : scene_(scene),
           orders_(transport.max_bounces.value_or(most_events)),
-          light_(scene, transport.looks, Sky::walk) {}
+          light_(scene, transport.looks, Flights::tracked) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
@@ -29,20 +29,25 @@ class Reference final : public Method {
         ScatterEvent event{flight.at(*distance), ray.direction, medium.albedo()};
         for (int order = 0;; ++order) {
             light_.add(event, order, order + 1, random, record);
-            const float u1 = order == 0 ? random.second[2] : walk.uniform();
-            const float u2 = order == 0 ? random.second[3] : walk.uniform();
+            const float u1 = order == 0 ? random.second()[2] : walk.uniform();
+            const float u2 = order == 0 ? random.second()[3] : walk.uniform();
             const V3f direction = medium.phase().sample(event.direction, u1, u2);
+            const float density = medium.phase().density(event.direction, direction);
+            light_.add_bridges(event, order, orders_, random, record);
             flight = medium.ray(event.position, direction);
             distance = delta_track(medium, flight, walk.exponential(), walk);
             if (!distance) {
-                light_.add_escape(event, direction, order, record);
+                light_.add_escape(event, direction, density, order, record);
                 return;
             }
             if (order + 1 == orders_) {
                 record.bounded = orders_ == most_events;
                 return;
             }
-            event = {flight.at(*distance), direction, event.weight * medium.albedo()};
+            event = {flight.at(*distance),
+                     direction,
+                     event.weight * medium.albedo(),
+                     {1.0f / density, event.inverse_density[0]}};
             if (!survives(event.weight, walk)) return;
         }
     }
