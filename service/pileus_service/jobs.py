@@ -9,19 +9,23 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from pileus_service import __version__
 from pileus_service.shot import Shot
 
 Priority = Annotated[int, Field(ge=0, le=9)]
 JOB_ID = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 JobId = Annotated[str, StringConstraints(pattern=rf"^{JOB_ID.pattern}$")]
 Bucket = tuple[int, int, int, int]
+# Of a job's files, tasks and keys. A worker takes jobs up to its own format, so raise it when an
+# older worker would misread a newer job; a further field that may be ignored needs none.
+FORMAT = 1
 TERMINAL = frozenset({"done", "failed", "cancelled"})
 
 
 class Record(BaseModel):
-    """A message or a file of the farm's own."""
+    """A message or a file of the farm's own; a newer program's may say more than we know."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True)
 
 
 class JobState(StrEnum):
@@ -57,7 +61,7 @@ class Wish(Record):
 
 
 class Cache(Record):
-    """A cache file as it was when its frame was planned."""
+    """A cache file as it was when its frame was planned; its path is the shot's."""
 
     path: str
     mtime_ns: int
@@ -120,8 +124,10 @@ class Task(Record):
 
 
 class Planned(Record):
-    """A plan's result; parts already on disk are finished and not rendered again."""
+    """A plan's result; parts already on disk are finished and not rendered again. The same version
+    of Pileus renders the parts, as another's might differ in their bits."""
 
+    version: str = __version__
     tasks: int
     finished: list[int]
     total: int
@@ -139,7 +145,13 @@ class Merged(Record):
     reason: str = ""
 
 
-Result = Planned | Rendered | Merged
+class Replan(Record):
+    """What comes of a part or a merge whose plan is of a version that no worker is of any more."""
+
+    replan: Literal[True] = True
+
+
+Result = Planned | Rendered | Merged | Replan
 
 
 class WorkerInfo(Record):
@@ -150,6 +162,7 @@ class WorkerInfo(Record):
     pid: int
     threads: int
     started: float
+    version: str = __version__
     task: Task | None = None
     samples: int = 0
 

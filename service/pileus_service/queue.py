@@ -17,6 +17,7 @@ from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
 
 from pileus_service.jobs import (
+    FORMAT,
     FrameView,
     JobState,
     JobView,
@@ -57,11 +58,11 @@ def connect(url: str) -> "Redis":
 class Queue:
     """Submitting, claiming, renewing, completing, releasing and steering tasks."""
 
-    def __init__(self, redis: "Redis", lease: float = LEASE) -> None:
+    def __init__(self, redis: "Redis", lease: float = LEASE, task_format: int = FORMAT) -> None:
         self.redis = redis
         self.lease = lease
         folder = files("pileus_service") / "lua"
-        common = (folder / "common.lua").read_text()
+        common = f"local FORMAT = {task_format}\n" + (folder / "common.lua").read_text()
         self._scripts = {
             name: redis.register_script(common + (folder / f"{name}.lua").read_text())
             for name in SCRIPTS
@@ -253,6 +254,7 @@ class Queue:
         """Says goodbye: a worker that ends in order is not waited for."""
         self.redis.zrem("pileus:alive", worker)
         self.redis.delete(f"pileus:worker:{worker}")
+        self.redis.hdel("pileus:versions", worker)
         for priority in PRIORITIES:
             stream = f"pileus:tasks:{priority}"
             if self.redis.exists(stream):

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
@@ -288,19 +288,19 @@ class Shot(Model):
 
     def anchored(self, folder: Path) -> "Shot":
         """The same shot with every path absolute, relative ones taken from the folder."""
+        return self.with_paths(lambda path: str(folder / path))
 
-        def anchor(path: str) -> str:
-            return str(folder / path)
-
+    def with_paths(self, change: Callable[[str], str]) -> "Shot":
+        """The same shot with every path changed."""
         return self.model_copy(
             update={
-                "image": self.image.model_copy(update={"output": anchor(self.image.output)}),
+                "image": self.image.model_copy(update={"output": change(self.image.output)}),
                 "volumes": tuple(
-                    volume.model_copy(update={"cache": anchor(volume.cache)})
+                    volume.model_copy(update={"cache": change(volume.cache)})
                     for volume in self.volumes
                 ),
                 "lights": tuple(
-                    light.model_copy(update={"texture": anchor(light.texture)})
+                    light.model_copy(update={"texture": change(light.texture)})
                     if isinstance(light, DomeLight) and light.texture
                     else light
                     for light in self.lights

@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import pileus_core as core
 
 from pileus_service.jobs import Cache
+from pileus_worker.paths import NOWHERE_ELSE, PathMap
 
 Key = tuple[str, int, int, str]
 
@@ -14,8 +15,9 @@ Key = tuple[str, int, int, str]
 class Caches:
     """Least recently used go first; a file that has changed is read anew."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, paths: PathMap = NOWHERE_ELSE) -> None:
         self._limit = limit
+        self._paths = paths
         self._held: OrderedDict[Key, Future[core.Volume]] = OrderedDict()
         self._lock = threading.Lock()
         self._reader = ThreadPoolExecutor(2, thread_name_prefix="reader")
@@ -44,7 +46,7 @@ class Caches:
 
     def _begin(self, key: Key) -> Future[core.Volume]:
         if key not in self._held:
-            self._held[key] = self._reader.submit(core.Volume, key[0], key[3])
+            self._held[key] = self._reader.submit(core.Volume, self._paths.here(key[0]), key[3])
         return self._held[key]
 
     def _evict(self, keep: Key) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pileus_service.jobs import Job, Kind, Result
+from pileus_worker.paths import PathMap
 
 TICK = 0.1
 
@@ -26,6 +27,7 @@ class Setup:
     threads: int
     cache_bytes: int
     task_seconds: float
+    paths: PathMap
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def run(pipe: "Connection[Any, Any]", setup: Setup) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
     store, roots = Store(setup.data), Roots(setup.roots)
-    caches = Caches(setup.cache_bytes)
+    caches = Caches(setup.cache_bytes, setup.paths)
     executor = ThreadPoolExecutor(1, thread_name_prefix="task")
     try:
         while True:
@@ -89,6 +91,7 @@ def run(pipe: "Connection[Any, Any]", setup: Setup) -> None:
                 order.frame,
                 order.kind,
                 order.part,
+                setup.paths,
             )
             future = executor.submit(work.run)
             while not wait([future], TICK).done:

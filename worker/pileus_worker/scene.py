@@ -11,6 +11,7 @@ from pileus_service import __version__
 from pileus_service.frames import expand
 from pileus_service.jobs import Cache
 from pileus_service.shot import DistantLight, Shot
+from pileus_worker.paths import NOWHERE_ELSE, PathMap
 
 Header = dict[str, str | float | tuple[int, int] | list[float]]
 
@@ -19,13 +20,14 @@ def cache_path(shot: Shot, frame: int) -> Path:
     return Path(expand(shot.volumes[0].cache, frame))
 
 
-def cache_of(shot: Shot, frame: int) -> Cache:
+def cache_of(shot: Shot, frame: int, paths: PathMap = NOWHERE_ELSE) -> Cache:
     """The cache file of a frame as it is on disk now."""
     path = cache_path(shot, frame)
+    here = paths.here(str(path))
     try:
-        found = path.stat()
+        found = Path(here).stat()
     except OSError as error:
-        raise core.InputError(f"volumes.0.cache: {path}: {error.strerror}; mend the path") from None
+        raise core.InputError(f"volumes.0.cache: {here}: {error.strerror}; mend the path") from None
     return Cache(path=str(path), mtime_ns=found.st_mtime_ns, size=found.st_size)
 
 

@@ -31,6 +31,7 @@ from pileus_service.jobs import Task, WorkerInfo
 from pileus_service.queue import RENEWAL, Queue
 from pileus_service.store import Store
 from pileus_worker import child
+from pileus_worker.paths import PathMap
 
 log = logging.getLogger(__name__)
 
@@ -122,12 +123,19 @@ class Child:
 class Supervisor:
     """One worker's life."""
 
-    def __init__(self, queue: Queue, store: Store, roots: tuple[Path, ...], limits: Limits) -> None:
+    def __init__(
+        self,
+        queue: Queue,
+        store: Store,
+        roots: tuple[Path, ...],
+        limits: Limits,
+        paths: PathMap,
+    ) -> None:
         self._queue = queue
         self._store = store
         self._limits = limits
         self._setup = child.Setup(
-            store.root, roots, limits.threads, limits.cache_bytes, limits.task_seconds
+            store.root, roots, limits.threads, limits.cache_bytes, limits.task_seconds, paths
         )
         host = socket.gethostname()
         self.info = WorkerInfo(

@@ -18,12 +18,14 @@ from pileus_service.jobs import (
     Plan,
     Planned,
     Rendered,
+    Replan,
     Result,
 )
 from pileus_service.roots import Roots
 from pileus_service.store import FrameStore, Store
 from pileus_worker import planning, scene
 from pileus_worker.caches import Caches
+from pileus_worker.paths import PathMap
 from pileus_worker.pictures import write_preview
 
 
@@ -40,23 +42,26 @@ class Work:
     frame: int
     kind: Kind
     part: int
+    paths: PathMap
     control: core.Control = field(default_factory=core.Control)
 
     def run(self) -> Result:
-        self.roots.check(self.job.shot, [self.frame])
+        self.roots.check(self.paths.shot(self.job.shot), [self.frame])
         files = self.store.frame(self.job.id, self.frame)
         if self.kind is Kind.PLAN:
             return self._plan(files)
         plan = files.plan()
         if plan is None:
             raise InputError(f"frame {self.frame}: its plan is gone from the data folder")
+        if plan.identity != scene.identity(self.job.shot, self.frame, plan.cache):
+            return Replan()
         if self.kind is Kind.RENDER:
             return self._render(files, plan)
         return self._merge(files, plan)
 
     def _plan(self, files: FrameStore) -> Planned:
         """Makes the frame's plan, or takes up one that is there, with what it has finished."""
-        cache = scene.cache_of(self.job.shot, self.frame)
+        cache = scene.cache_of(self.job.shot, self.frame, self.paths)
         identity = scene.identity(self.job.shot, self.frame, cache)
         plan = files.plan()
         if plan is not None and plan.identity != identity:
@@ -143,7 +148,7 @@ class Work:
     def _write(self, files: FrameStore, frame: core.Frame, seconds: float) -> None:
         shot = self.job.shot
         transport = scene.make_transport(shot)
-        output = shot.output(self.frame)
+        output = self.paths.shot(shot).output(self.frame)
         output.parent.mkdir(parents=True, exist_ok=True)
         frame.write(
             str(output),
@@ -154,7 +159,7 @@ class Work:
         files.mark_done(
             Done(
                 frame=self.frame,
-                file=str(output),
+                file=str(shot.output(self.frame)),
                 seconds=seconds,
                 samples=shot.sampling.samples,
                 method=shot.transport.method,
@@ -165,11 +170,11 @@ class Work:
         files.drop_parts()
 
     def _scene(self, cache: Cache) -> core.Scene:
-        now = scene.cache_of(self.job.shot, self.frame)
+        now = scene.cache_of(self.job.shot, self.frame, self.paths)
         if now != cache:
             raise InputError(f"{cache.path}: has changed since its frame was planned; submit again")
         volume = self.caches.get(cache, self.job.shot.volumes[0].density)
-        return scene.make_scene(self.job.shot, self.frame, volume)
+        return scene.make_scene(self.paths.shot(self.job.shot), self.frame, volume)
 
     def _samples(self, view: core.Scene, bucket: Bucket, samples: tuple[int, int]) -> core.Partial:
         shot = self.job.shot
@@ -189,8 +194,9 @@ class Work:
         """Begins to read the next frame's cache; if that cannot be, its own task will say so."""
         shot = self.job.shot
         later = [frame for frame in shot.frame_numbers if frame > self.frame]
-        if later and scene.cache_path(shot, later[0]).exists():
-            self.caches.read_ahead(scene.cache_of(shot, later[0]), shot.volumes[0].density)
+        if later and scene.cache_path(self.paths.shot(shot), later[0]).exists():
+            cache = scene.cache_of(shot, later[0], self.paths)
+            self.caches.read_ahead(cache, shot.volumes[0].density)
 
 
 def _whole(path: Path, identity: str) -> bool:

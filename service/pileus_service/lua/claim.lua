@@ -17,15 +17,15 @@ local function reclaim(priority, stream)
       local task = read(stream, id)
       if not task then
         redis.call('XACK', stream, GROUP, id)
-      elseif not wanted(task) then
+      elseif readable(task) and not wanted(task) then
         discard(stream, id, task.job)
-      elseif redis.call('HGET', job_of(task.job), 'state') == 'running' then
+      elseif readable(task) and redis.call('HGET', job_of(task.job), 'state') == 'running' then
         if owner ~= RELEASED then
           record_try(stream, id, owner, 'stopped answering')
           count('leases_lost')
           redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'JUSTID')
         end
-        local fate = verdict(stream, id, attempts, worker)
+        local fate = suits(task, worker) and verdict(stream, id, task, attempts, worker)
         if fate == 'park' then
           park(stream, id, task)
         elseif fate == 'take' then
@@ -39,6 +39,11 @@ local function reclaim(priority, stream)
   end
 end
 
+-- An entry that was delivered to us, and is for a newer worker or one of another version.
+local function leave_to_others(stream, id)
+  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'RETRYCOUNT', 0, 'JUSTID')
+end
+
 local function take_new(priority, stream)
   while true do
     local reply = redis.call('XREADGROUP', 'GROUP', GROUP, worker, 'COUNT', 1, 'STREAMS', stream, '>')
@@ -46,7 +51,9 @@ local function take_new(priority, stream)
     local id = reply[1][2][1][1]
     local task = read(stream, id)
     local state, gen = unpack(redis.call('HMGET', job_of(task.job), 'state', 'gen'))
-    if gen ~= task.gen then
+    if not readable(task) then
+      leave_to_others(stream, id)
+    elseif gen ~= task.gen then
       -- A copy went to another stream when the job's priority changed; this one counts for nothing.
       redis.call('XACK', stream, GROUP, id)
       redis.call('XDEL', stream, id)
@@ -56,6 +63,8 @@ local function take_new(priority, stream)
       redis.call('RPUSH', job_of(task.job) .. ':held', cjson.encode({ task.frame, task.kind, task.part }))
       redis.call('XACK', stream, GROUP, id)
       redis.call('XDEL', stream, id)
+    elseif not suits(task, worker) then
+      leave_to_others(stream, id)
     else
       return given(priority, id, 1, task)
     end

@@ -1,6 +1,6 @@
 -- Shared by every script, put before each: key names and the life of a job's frames and tasks.
--- A stream entry is {job, frame, kind, part, gen}; `frame` is an index into the shot's frames and
--- `part` a task of the frame's plan. Only what is in flight is here; the rest waits on disk.
+-- A stream entry is {job, frame, kind, part, gen, format}; `frame` is an index into the shot's frames
+-- and `part` a task of the frame's plan. FORMAT, set before all this, is the newest that we can read. Only what is in flight is here; the rest waits on disk.
 -- ARGV[1] is the lease in milliseconds, ARGV[2] the worker or job that the script is about.
 
 local LEASE = tonumber(ARGV[1])
@@ -32,18 +32,28 @@ local function live_workers()
 end
 
 local function send(job, frame, kind, part)
-  local priority, gen = unpack(redis.call('HMGET', job_of(job), 'priority', 'gen'))
+  local priority, gen, format = unpack(redis.call('HMGET', job_of(job), 'priority', 'gen', 'format'))
   local stream = stream_of(priority)
   if redis.call('EXISTS', stream) == 0 then
     redis.call('XGROUP', 'CREATE', stream, GROUP, '0', 'MKSTREAM')
   end
-  redis.call('XADD', stream, '*', 'job', job, 'frame', frame, 'kind', kind, 'part', part, 'gen', gen)
+  redis.call('XADD', stream, '*', 'job', job, 'frame', frame, 'kind', kind, 'part', part, 'gen', gen,
+    'format', format)
 end
 
 -- Issues a task anew: it counts as outstanding until it is retired.
 local function issue(job, frame, kind, part)
   redis.call('HINCRBY', job_of(job), 'out', 1)
   send(job, frame, kind, part)
+end
+
+-- Begins a frame, or begins it again with nothing kept.
+local function plan_frame(job, frame)
+  local at = frame_of(job, frame)
+  redis.call('DEL', at, at .. ':bits')
+  redis.call('HSET', at, 'state', 'plan', 'tasks', 0, 'issued', 0, 'done', 0, 'redos', 0, 'samples', 0,
+    'total', 0, 'started', now())
+  issue(job, frame, 'plan', 0)
 end
 
 -- Takes an entry out of its stream for good; deleting only delivered ones keeps `lag` true.
@@ -83,9 +93,7 @@ local function refill(job)
       or redis.call('HEXISTS', key .. ':failed', coming) == 1
     if not settled then
       redis.call('ZADD', key .. ':active', coming, coming)
-      redis.call('HSET', frame_of(job, coming), 'state', 'plan', 'tasks', 0, 'issued', 0, 'done', 0,
-        'redos', 0, 'samples', 0, 'total', 0, 'started', now())
-      issue(job, coming, 'plan', 0)
+      plan_frame(job, coming)
       room, frame_room = room - 1, frame_room - 1
     end
     coming = coming + 1
@@ -123,14 +131,25 @@ local function fail_frame(job, frame, reason)
   advance(job)
 end
 
+-- Whether a task may go to a worker: a frame's parts and merge are for the version that planned it, as
+-- long as a worker of that version lives.
+local function suits(task, worker)
+  local planned = redis.call('HGET', frame_of(task.job, task.frame), 'version')
+  if not planned or planned == redis.call('HGET', 'pileus:versions', worker) then return true end
+  for _, other in ipairs(live_workers()) do
+    if planned == redis.call('HGET', 'pileus:versions', other) then return false end
+  end
+  return true
+end
+
 -- What an attempt's failure leads to for the worker that asks: 'take', 'skip' or 'park'.
 -- The delivery count is the attempt count. The attempts go to distinct workers while such live.
-local function verdict(stream, id, deliveries, worker)
+local function verdict(stream, id, task, deliveries, worker)
   local tries = tries_of(stream, id)
   if redis.call('HLEN', tries) >= ATTEMPTS then return 'park' end
   if redis.call('HEXISTS', tries, worker) == 0 then return 'take' end
   for _, other in ipairs(live_workers()) do
-    if redis.call('HEXISTS', tries, other) == 0 then return 'skip' end
+    if redis.call('HEXISTS', tries, other) == 0 and suits(task, other) then return 'skip' end
   end
   return deliveries >= ATTEMPTS and 'park' or 'take'
 end
@@ -162,13 +181,18 @@ local function read(stream, id)
   return task
 end
 
+-- Whether we know what the task says; a newer worker will.
+local function readable(task) return tonumber(task.format) <= FORMAT end
+
 -- Whether the job still waits for this task: not cancelled, not done already, frame not failed.
 local function wanted(task)
   local state = redis.call('HGET', job_of(task.job), 'state')
   if state ~= 'running' and state ~= 'paused' then return false end
   local at = frame_of(task.job, task.frame)
-  if redis.call('HGET', at, 'state') ~= task.kind then return false end
-  return task.kind ~= 'render' or redis.call('GETBIT', at .. ':bits', task.part) == 0
+  local stage, tasks = unpack(redis.call('HMGET', at, 'state', 'tasks'))
+  if stage ~= task.kind then return false end
+  if task.kind ~= 'render' then return true end
+  return tonumber(task.part) < tonumber(tasks) and redis.call('GETBIT', at .. ':bits', task.part) == 0
 end
 
 -- The pending record of an entry if the worker owns it, else nil.
@@ -181,4 +205,5 @@ end
 local function greet(worker, info)
   redis.call('ZADD', 'pileus:alive', now(), worker)
   redis.call('SET', 'pileus:worker:' .. worker, info, 'PX', 86400000)
+  redis.call('HSET', 'pileus:versions', worker, cjson.decode(info).version)
 end

@@ -21,8 +21,10 @@ local function merge_if_whole()
   issue(job, frame, 'merge', 0)
 end
 
-if task.kind == 'plan' then
-  redis.call('HSET', at, 'state', 'render', 'tasks', result.tasks, 'done', #result.finished,
+if result.replan then
+  plan_frame(job, frame)
+elseif task.kind == 'plan' then
+  redis.call('HSET', at, 'version', result.version, 'state', 'render', 'tasks', result.tasks, 'done', #result.finished,
     'total', result.total, 'samples', result.samples)
   for _, part in ipairs(result.finished) do redis.call('SETBIT', at .. ':bits', part, 1) end
   merge_if_whole()

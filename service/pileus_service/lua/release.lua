@@ -11,7 +11,7 @@ if reason == '' then
 end
 record_try(stream, id, worker, reason)
 local task = read(stream, id)
-if wanted(task) and verdict(stream, id, attempts, worker) == 'park' then
+if wanted(task) and verdict(stream, id, task, attempts, worker) == 'park' then
   park(stream, id, task)
   return 'parked'
 end

@@ -13,6 +13,7 @@ from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
 from pileus_service.store import Store
 from pileus_worker import machine
+from pileus_worker.paths import PathMap
 from pileus_worker.supervisor import Limits, Supervisor
 
 app = typer.Typer()
@@ -31,6 +32,14 @@ def worker(
     ),
     root: Annotated[
         list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
+    ] = None,
+    maps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            metavar="FROM=TO",
+            help="The shots' folder FROM is TO on this machine; repeatable.",
+        ),
     ] = None,
     threads: Annotated[int, typer.Option(min=0, max=1024, help="0 takes all cores.")] = 0,
     memory: Annotated[
@@ -52,4 +61,5 @@ def worker(
     except ValueError as error:
         raise InputError(f"--redis {redis}: {error}") from None
     roots = Roots(root or [Path.cwd()])
-    Supervisor(queue, Store(data.resolve()), tuple(roots.folders), limits).run(stop)
+    paths = PathMap.parse(maps or [])
+    Supervisor(queue, Store(data.resolve()), tuple(roots.folders), limits, paths).run(stop)

@@ -1,0 +1,184 @@
+"""An upgrade with old and new workers side by side: each takes what it understands, and no frame
+mixes the bits of two versions."""
+
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+import pytest
+from redis import Redis
+
+import pileus_service
+import pileus_worker
+from hosts import PILEUS, process, service, until
+from pileus_service.jobs import (
+    FORMAT,
+    Kind,
+    Merged,
+    Planned,
+    Rendered,
+    Replan,
+    Result,
+    Wish,
+    WorkerInfo,
+)
+from pileus_service.queue import Queue
+from pileus_service.shot import Shot
+
+LEASE = 0.5
+
+
+def worker(name: str, version: str) -> WorkerInfo:
+    return WorkerInfo(name=name, host="host", pid=1, threads=1, started=0.0, version=version)
+
+
+OLD, OTHER_OLD, NEW = worker("old", "1"), worker("other old", "1"), worker("new", "2")
+
+
+def plan(version: str) -> Planned:
+    return Planned(tasks=3, finished=[], total=30, samples=0, version=version)
+
+
+def test_a_worker_leaves_jobs_of_a_newer_format_to_newer_workers(redis: Redis) -> None:
+    old, new = Queue(redis, LEASE), Queue(redis, LEASE, FORMAT + 1)
+    new.submit("newer", "newer", time.time(), 1, Wish(priority=9))
+    old.submit("older", "older", time.time(), 1, Wish())
+    task = old.claim(OLD)
+    assert task and task.job == "older"
+    assert old.claim(OTHER_OLD) is None
+    taken = new.claim(NEW)
+    assert taken and (taken.job, taken.attempt) == ("newer", 1)
+    assert new.complete(taken, NEW.name, plan("2"))
+    assert old.claim(OTHER_OLD) is None
+    old.hand_back(task, OLD.name)
+    jobs = set()
+    while found := new.claim(NEW):
+        jobs.add(found.job)
+    assert jobs == {"newer", "older"}
+
+
+def test_a_frame_stays_with_the_version_that_planned_it(redis: Redis) -> None:
+    queue = Queue(redis, LEASE)
+    queue.submit("job", "job", time.time(), 1, Wish())
+    task = queue.claim(OLD)
+    assert task
+    queue.complete(task, OLD.name, plan("1"))
+    assert queue.claim(NEW) is None
+    parts = []
+    while task := queue.claim(OTHER_OLD):
+        parts.append(task.part)
+        result = Rendered(samples=10) if task.kind is Kind.RENDER else Merged()
+        queue.complete(task, OTHER_OLD.name, result)
+    assert parts[:3] == [0, 1, 2]
+    seen = queue.job("job")
+    assert seen and seen.state == "done"
+
+
+def test_a_failed_attempt_is_not_left_waiting_for_workers_of_another_version(redis: Redis) -> None:
+    queue = Queue(redis, LEASE)
+    queue.submit("job", "job", time.time(), 1, Wish())
+    task = queue.claim(OLD)
+    assert task
+    queue.complete(task, OLD.name, Planned(tasks=1, finished=[], total=1, samples=0, version="1"))
+    for attempt in (1, 2, 3):
+        queue.claim(NEW)
+        task = queue.claim(OLD)
+        assert task and task.attempt == attempt
+        queue.fail(task, OLD.name, "no good")
+    seen = queue.job("job")
+    assert seen and seen.state == "failed"
+
+
+def test_a_frame_whose_version_is_gone_is_planned_anew(redis: Redis) -> None:
+    queue = Queue(redis, LEASE)
+    queue.submit("job", "job", time.time(), 1, Wish())
+    task = queue.claim(OLD)
+    assert task
+    queue.complete(task, OLD.name, plan("1"))
+    task = queue.claim(OLD)
+    assert task
+    queue.complete(task, OLD.name, Rendered(samples=10))
+    left = queue.claim(OLD)
+    assert left and left.kind is Kind.RENDER
+    queue.leave(OLD.name)
+    task = queue.claim(NEW)
+    assert task and task.kind is Kind.RENDER
+    queue.complete(task, NEW.name, Replan())
+    assert not queue.complete(left, "nobody", Rendered(samples=10))
+    time.sleep(LEASE * 1.2)
+    # The lease of the one that left runs out amid the new plan; nothing is lost or counted twice.
+    done: list[tuple[str, int]] = []
+    while task := queue.claim(NEW):
+        done.append((task.kind, task.part))
+        results: dict[Kind, Result] = {
+            Kind.PLAN: Planned(tasks=1, finished=[], total=10, samples=0, version="2"),
+            Kind.RENDER: Rendered(samples=10),
+            Kind.MERGE: Merged(),
+        }
+        queue.complete(task, NEW.name, results[task.kind])
+    assert done == [("plan", 0), ("render", 0), ("merge", 0)]
+    seen = queue.job("job")
+    assert seen and (seen.state, seen.frames_done) == ("done", 1)
+
+
+@pytest.fixture
+def former(tmp_path: Path) -> Path:
+    """This program as it was: the same code under an older version number."""
+    folder = tmp_path / "former"
+    for package in (pileus_service, pileus_worker, core):
+        source = Path(package.__file__ or "").parent
+        shutil.copytree(source, folder / source.name)
+        with (folder / source.name / "__init__.py").open("a") as file:
+            file.write('\n__version__ = "0.0.1"\n')
+    return folder
+
+
+@pytest.mark.slow
+def test_an_upgrade_mixes_no_versions_in_a_frame(
+    tmp_path: Path, redis_url: str, redis: Redis, shot: dict[str, Any], former: Path
+) -> None:
+    cache, data = tmp_path / "cloud.vdb", tmp_path / "data"
+    core.make_cloud(str(cache), frame=1, frames=1, resolution=32)
+    shot |= {"frames": "1-6", "sampling": {"samples": 400}}
+    shot["volumes"][0]["cache"] = str(cache)
+    asked = Shot.model_validate(shot)
+    command: list[str | Path] = [PILEUS.with_name("python"), "-m", "pileus_worker"]
+    command += ["--data", data]
+    command += ["--redis", redis_url, "--root", tmp_path, "--threads", "1", "--task-seconds", ".05"]
+    seen: dict[int, set[str]] = {}
+    with (
+        service(data, redis_url, tmp_path) as client,
+        process(tmp_path / "old.log", *command, env={"PYTHONPATH": str(former)}) as old,
+        process(tmp_path / "new.log", *command),
+    ):
+        until(lambda: len({each.version for each in client.workers()}) == 2, 60)
+        job = client.submit(asked).job.id
+
+        def both_at_work() -> bool:
+            for each in client.workers():
+                if each.task and each.task.kind in (Kind.RENDER, Kind.MERGE):
+                    seen.setdefault(each.task.frame, set()).add(each.version)
+            return len(set[str]().union(*seen.values())) == 2
+
+        until(both_at_work, 60)
+        for _ in range(10):
+            both_at_work()
+            time.sleep(0.05)
+        assert all(len(versions) == 1 for versions in seen.values())
+        # The frame that the old one is amid is planned anew by the new one.
+        old.send_signal(signal.SIGKILL)
+        until(lambda: client.job(job).state in ("done", "failed"), 120)
+        assert client.job(job).state == "done", client.job(job).reason
+    file = tmp_path / "shot.json"
+    file.write_text(asked.model_dump_json())
+    subprocess.run([PILEUS, "render", file, "--out", tmp_path / "here"], check=True)
+    for frame in asked.frame_numbers:
+        [farm] = core.read_image(str(asked.output(frame))).values()
+        [here] = core.read_image(str(tmp_path / "here" / asked.output(frame).name)).values()
+        for name, values in here.items():
+            np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
