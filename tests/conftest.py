@@ -12,14 +12,20 @@ from pileus_worker.private_redis import PrivateRedis
 
 
 @pytest.fixture(scope="session")
-def redis_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def private_redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrivateRedis]:
     with PrivateRedis(tmp_path_factory.mktemp("redis")) as server:
-        yield server.url
+        yield server
+
+
+@pytest.fixture(scope="session")
+def redis_url(private_redis: PrivateRedis) -> str:
+    """For the farm's own user, who may do what the farm does and no more."""
+    return private_redis.farm_url
 
 
 @pytest.fixture
-def redis(redis_url: str) -> Iterator[Redis]:
-    with connect(redis_url) as client:
+def redis(private_redis: PrivateRedis) -> Iterator[Redis]:
+    with connect(private_redis.url) as client:
         client.flushall()
         yield client
 

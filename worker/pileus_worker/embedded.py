@@ -89,8 +89,8 @@ def embedded_farm(
         contextlib.closing(bind(listen)) as listener,
         (data / "workers.log").open("ab") as log,
     ):
-        server = make_server(data, redis.url, roots, listen)
-        workers = Workers(_command(data, redis.url, roots, count, task_seconds), count, log)
+        server = make_server(data, redis.farm_url, roots, listen)
+        workers = Workers(_command(data, redis.farm_url, roots, count, task_seconds), count, log)
         ending, over = threading.Event(), threading.Event()
         service = threading.Thread(target=server.run, args=([listener],), name="service")
         keeper = threading.Thread(target=_keep_up, args=(ending, over, redis, workers), daemon=True)

@@ -1,8 +1,12 @@
-"""A Redis of our own: a child process on a Unix socket, its append-only file in a folder."""
+"""A Redis of our own: a child process on a Unix socket, its append-only file in a folder.
+
+Its settings are those of a farm of many machines (redis.conf), the farm's narrow user included.
+"""
 
 import shutil
 import subprocess
 import tempfile
+from importlib.resources import files
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -14,16 +18,24 @@ from pileus_service.errors import FarmError
 from pileus_service.queue import UNREACHABLE
 from pileus_worker.lifeline import die_with_parent
 
+NO_PASSWORD_FITS = "#" + 64 * "0"
+
 
 class PrivateRedis:
-    """Starts on entry, answers before entry ends, is stopped in order on exit."""
+    """Starts on entry, answers before entry ends, is stopped in order on exit. `url` may do all,
+    `farm_url` what the farm does."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         # Not in the folder itself: a socket's path may have 107 characters at most.
         self._socket_folder = Path(tempfile.mkdtemp(prefix="pileus-"))
         self._socket = self._socket_folder / "redis"
+        self._settings = self._socket_folder / "redis.conf"
+        # The socket lies in a folder of ours alone, which is password enough.
+        shared = (files("pileus_worker") / "redis.conf").read_text()
+        self._settings.write_text(shared.replace(NO_PASSWORD_FITS, "nopass"))
         self.url = f"unix://{self._socket}"
+        self.farm_url = f"unix://pileus@{self._socket}"
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -53,12 +65,11 @@ class PrivateRedis:
             "unixsocket": str(self._socket),
             "unixsocketperm": "700",
             "dir": str(self._folder.resolve()),
-            "appendonly": "yes",
-            "save": "",
             "logfile": "redis.log",
         }
+        words = [word for key, value in options.items() for word in (f"--{key}", value)]
         self._process = subprocess.Popen(
-            [program, *(word for key, value in options.items() for word in (f"--{key}", value))],
+            [program, self._settings, *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             # Away from the terminal's Ctrl-C: Redis is the last to go.
