@@ -2,11 +2,11 @@
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
+import structlog
 from fastapi import APIRouter, Depends, FastAPI, Header, Query, Response
 from fastapi import Path as PathParam
 from fastapi.responses import FileResponse
@@ -15,14 +15,14 @@ from redis.exceptions import RedisError
 from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
-from pileus_service import __version__, metrics, problems
+from pileus_service import __version__, framelog, metrics, problems
 from pileus_service.auth import Guard
 from pileus_service.farm import ConflictError, Farm
 from pileus_service.jobs import JOB_ID, TERMINAL, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted, Change, Submission
 from pileus_service.problems import Problem
 
-log = logging.getLogger(__name__)
+log = structlog.stdlib.get_logger(__name__)
 
 MAX_BODY = 1 << 20
 T = TypeVar("T")
@@ -47,7 +47,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
             try:
                 await run_in_threadpool(farm.reconcile)
             except (RedisError, OSError) as error:
-                log.warning("cannot reconcile yet: %s", error)
+                log.warning("cannot reconcile yet", reason=str(error))
             await asyncio.sleep(1)
 
     @contextlib.asynccontextmanager
@@ -120,6 +120,13 @@ def _jobs(farm: Farm) -> APIRouter:
     def image(job_id: Id, frame: FrameNumber) -> FileResponse:
         done = _found(farm.done(job_id, frame), f"{job_id}, frame {frame}")
         return _file(Path(done.file), "image/x-exr")
+
+    @router.get("/{job_id}/frames/{frame}/log")
+    def frame_log(job_id: Id, frame: FrameNumber, limit: Limit = 1000) -> list[framelog.LogLine]:
+        """The last lines of every attempt at a frame's tasks, in the order of their time."""
+        if not farm.store.has(job_id):
+            raise Problem(404, f"No {job_id} here")
+        return framelog.read(farm.store.frame(job_id, frame).logs, limit)
 
     @router.post("/{job_id}/cancel")
     def cancel(job_id: Id) -> JobView:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from pydantic import BaseModel
 from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
@@ -17,7 +18,7 @@ from typer.main import get_command
 from pileus_service import __version__
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
-from pileus_service.jobs import JobState, Record
+from pileus_service.jobs import JobState
 from pileus_service.progress import duration
 from pileus_service.shotfile import load_shot
 from pileus_service.watching import describe, wait_for
@@ -156,6 +157,29 @@ def status(
     Console().print(table)
 
 
+@app.command("log")
+def frame_log(
+    job: JobArgument,
+    frame: Annotated[int, typer.Argument(metavar="FRAME", min=0, help="The frame's number.")],
+    server: Server = LOCAL,
+    token: Token = None,
+    as_json: AsJson = False,
+) -> None:
+    """Shows what every attempt at a frame had to say."""
+    with Client(server, token) as client:
+        lines = client.log(job, frame)
+    if as_json:
+        _print_json(lines)
+        return
+    for line in lines:
+        told = [line.time[:19], line.worker, line.task, line.event]
+        told += [f"in {line.seconds:.2f} s"] if line.seconds is not None else []
+        told += [line.reason] if line.reason else []
+        print("  ".join(told))
+        for text in (line.output or "").splitlines():
+            print(f"    {text}")
+
+
 def _verb(verb: Literal["cancel", "pause", "resume"], text: str) -> None:
     @app.command(verb, help=text)
     def act(
@@ -215,7 +239,7 @@ def _table(*columns: str) -> Table:
     return table
 
 
-def _print_json(thing: Record | list[Any]) -> None:
+def _print_json(thing: BaseModel | list[Any]) -> None:
     if isinstance(thing, list):
         print(json.dumps([each.model_dump(mode="json") for each in thing]))
     else:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, TypeAdapter
 from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_random_exponential
 
 from pileus_service.errors import FarmError, InputError
+from pileus_service.framelog import LogLine
 from pileus_service.jobs import TERMINAL, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted
 from pileus_service.shot import Shot
@@ -60,6 +61,10 @@ class Client:
             if len(page) < 1000:
                 return
             offset += len(page)
+
+    def log(self, job: str, frame: int) -> list[LogLine]:
+        answer = self._ask("GET", f"/jobs/{job}/frames/{frame}/log")
+        return TypeAdapter(list[LogLine]).validate_json(answer.content)
 
     def control(self, job: str, verb: str) -> JobView:
         return JobView.model_validate_json(self._ask("POST", f"/jobs/{job}/{verb}").content)

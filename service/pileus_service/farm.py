@@ -3,6 +3,8 @@
 import threading
 import time
 
+import structlog
+
 from pileus_service.errors import InputError
 from pileus_service.jobs import (
     TERMINAL,
@@ -21,6 +23,8 @@ from pileus_service.roots import Roots
 from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files
 from pileus_service.store import Store
+
+log = structlog.stdlib.get_logger(__name__)
 
 _WISHED: dict[str, Verb] = {"paused": "pause", "running": "resume", "cancelled": "cancel"}
 
@@ -52,6 +56,8 @@ class Farm:
             held = self.store.job(job.id)
             if held is not None and held.shot != shot:
                 raise ConflictError("Idempotency-Key: was used for another shot; take a new key")
+        if new:
+            log.info("submitted", job=job.id, name=shot.name, frames=len(numbers))
         view = self.job(job.id)
         assert view is not None
         return view, new
@@ -70,6 +76,7 @@ class Farm:
                 wish = wish.model_copy(update={"state": state})
             self._keep(job_id, wish)
             self.queue.control(job_id, verb, priority)
+            log.info(verb, job=job_id, **({"priority": priority} if verb == "priority" else {}))
             return self.job(job_id)
 
     def remove(self, job_id: str) -> bool:
@@ -81,6 +88,7 @@ class Farm:
             self.store.remove(job_id)
             self.queue.control(job_id, "cancel")
             self.queue.control(job_id, "remove")
+            log.info("removed", job=job_id)
             return True
 
     def job(self, job_id: str) -> JobView | None:
@@ -179,6 +187,7 @@ class Farm:
                 }
             )
             self._keep(job_id, wish)
+            log.info("ended", job=job_id, state=state, failed=len(wish.failed))
 
     def _keep(self, job_id: str, wish: Wish) -> None:
         self.store.wish(job_id, wish)

@@ -43,6 +43,17 @@ class Kind(StrEnum):
     MERGE = "merge"
 
 
+class Cause(StrEnum):
+    """Why an attempt failed, as it is counted. A lease that ran out is counted by the queue."""
+
+    INPUT = "input"
+    DISK = "disk"
+    MEMORY = "memory"
+    CRASH = "crash"
+    HANG = "hang"
+    ERROR = "error"
+
+
 class Job(Record):
     """A job as it was submitted: job.json."""
 
@@ -118,9 +129,13 @@ class Task(Record):
     kind: Kind
     part: int
 
+    @property
+    def label(self) -> str:
+        """What it is of its frame: plan, render 7, merge."""
+        return f"{self.kind} {self.part}" if self.kind is Kind.RENDER else str(self.kind)
+
     def __str__(self) -> str:
-        part = f" {self.part}" if self.kind is Kind.RENDER else ""
-        return f"{self.job} frame[{self.frame}] {self.kind}{part}"
+        return f"{self.job} frame[{self.frame}] {self.label}"
 
 
 class Planned(Record):

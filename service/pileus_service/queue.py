@@ -6,6 +6,7 @@ flight: `pileus_service.store` is the truth.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterable
 from importlib.resources import files
 from typing import Any, Literal, cast
@@ -205,6 +206,27 @@ class Queue:
                 held = cast(dict[str, int], self.redis.xpending(stream, GROUP))["pending"]
                 depths[priority] = (length - held, held)
         return depths
+
+    def waits(self) -> dict[int, float]:
+        """Seconds that the next task of each priority has waited; 0 where none waits."""
+        waits = {}
+        for priority in PRIORITIES:
+            stream = f"pileus:tasks:{priority}"
+            if self.redis.exists(stream):
+                [group] = cast(list[dict[str, str]], self.redis.xinfo_groups(stream))
+                after = f"({group['last-delivered-id']}"
+                ahead = cast(list[Any], self.redis.xrange(stream, after, "+", 1))
+                begun = int(ahead[0][0].split("-")[0]) / 1000 if ahead else self.now()
+                waits[priority] = max(0.0, self.now() - begun)
+        return waits
+
+    def jobs_by_state(self) -> dict[JobState, int]:
+        """How many jobs there are in each state; those not begun count as running."""
+        pipe = self.redis.pipeline(transaction=False)
+        for job in self.job_ids():
+            pipe.hget(f"pileus:job:{job}", "state")
+        found = Counter(pipe.execute())
+        return {state: found[state] for state in JobState if state is not JobState.QUEUED}
 
     def forget_dead(self) -> None:
         """Drops workers not seen for a day, so that restarts leave nothing behind."""

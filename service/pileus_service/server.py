@@ -7,6 +7,7 @@ from pathlib import Path
 
 import uvicorn
 
+from pileus_service import logs
 from pileus_service.app import create_app
 from pileus_service.auth import guard_for
 from pileus_service.errors import InputError
@@ -51,10 +52,13 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
         raise InputError(f"--redis {redis_url}: {error}") from None
     app = create_app(Farm(store, queue, Roots(roots)), guard)
     # Watchers hold their connections open: they are not waited for at the end.
-    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(
+        app, log_config=None, access_log=False, log_level="warning", timeout_graceful_shutdown=1
+    )
     return uvicorn.Server(config)
 
 
 def serve(data: Path, redis_url: str, roots: list[Path], listen: str) -> None:
+    logs.configure()
     with contextlib.closing(bind(listen)) as listener:
         make_server(data, redis_url, roots, listen).run([listener])

@@ -2,7 +2,8 @@
 
 Every file is written whole or not at all, so what is there can be trusted after any crash, and
 Redis can be rebuilt from it. Layout: jobs/ID/{job.json,state.json}, jobs/ID/frames/NNNNNN/
-{plan.json,preview.png,done.json,parts/BUCKET.SAMPLES.exr}.
+{plan.json,preview.png,done.json,
+parts/BUCKET.SAMPLES.exr,logs/WORKER.jsonl}.
 """
 
 import contextlib
@@ -52,6 +53,7 @@ class FrameStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.preview = folder / "preview.png"
+        self.logs = folder / "logs"
 
     def part(self, part: Part) -> Path:
         return self.folder / "parts" / part.name
@@ -96,6 +98,9 @@ class Store:
 
     def job(self, job_id: str) -> Job | None:
         return _read(self._folder(job_id) / "job.json", Job)
+
+    def has(self, job_id: str) -> bool:
+        return (self._folder(job_id) / "job.json").exists()
 
     def job_ids(self) -> Iterator[str]:
         for folder in sorted(self.jobs_folder.iterdir()):

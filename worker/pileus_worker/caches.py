@@ -21,6 +21,7 @@ class Caches:
         self._held: OrderedDict[Key, Future[core.Volume]] = OrderedDict()
         self._lock = threading.Lock()
         self._reader = ThreadPoolExecutor(2, thread_name_prefix="reader")
+        self.bytes_read = 0
 
     def get(self, cache: Cache, grid: str) -> core.Volume:
         """The volume, read now unless it is held or on its way."""
@@ -46,8 +47,14 @@ class Caches:
 
     def _begin(self, key: Key) -> Future[core.Volume]:
         if key not in self._held:
-            self._held[key] = self._reader.submit(core.Volume, self._paths.here(key[0]), key[3])
+            self._held[key] = self._reader.submit(self._read, key)
         return self._held[key]
+
+    def _read(self, key: Key) -> core.Volume:
+        volume = core.Volume(self._paths.here(key[0]), key[3])
+        with self._lock:
+            self.bytes_read += key[2]
+        return volume
 
     def _evict(self, keep: Key) -> None:
         with self._lock:

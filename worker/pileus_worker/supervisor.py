@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import structlog
 from redis.exceptions import RedisError
 from tenacity import (
     RetryError,
@@ -27,13 +28,16 @@ from tenacity import (
 )
 from tenacity.wait import wait_random_exponential
 
-from pileus_service.jobs import Task, WorkerInfo
+from pileus_service.jobs import Cause, Job, Task, WorkerInfo
+from pileus_service.measures import Measures
 from pileus_service.queue import RENEWAL, Queue
 from pileus_service.store import Store
 from pileus_worker import child
+from pileus_worker.accounts import account
+from pileus_worker.output import Output
 from pileus_worker.paths import PathMap
 
-log = logging.getLogger(__name__)
+log = structlog.stdlib.get_logger(__name__)
 
 IDLE = 0.2
 LOOK = 0.5
@@ -54,15 +58,20 @@ class Limits:
 class ChildLostError(Exception):
     """The child has ended, or has to; the message says how."""
 
+    def __init__(self, reason: str, cause: Cause = Cause.CRASH) -> None:
+        super().__init__(reason)
+        self.cause = cause
+
 
 class Child:
     """The render process as seen from outside."""
 
-    def __init__(self, setup: child.Setup) -> None:
+    def __init__(self, setup: child.Setup, output: Output) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe: Connection[Any, Any]
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=child.run, args=(theirs, setup), daemon=True)
+        arguments = (theirs, output.writing, setup)
+        self._process = context.Process(target=child.run, args=arguments, daemon=True)
         self._process.start()
         theirs.close()
         self._heard = time.monotonic()
@@ -84,7 +93,7 @@ class Child:
         except (EOFError, OSError):
             raise ChildLostError(self._how_it_ended()) from None
         if time.monotonic() - self._heard > SILENCE:
-            raise ChildLostError(f"the render process hung: silent for {SILENCE:.0f} s")
+            raise ChildLostError(f"the render process hung: silent for {SILENCE:.0f} s", Cause.HANG)
         return None
 
     def cancel(self) -> bool:
@@ -132,6 +141,7 @@ class Supervisor:
         paths: PathMap,
     ) -> None:
         self._queue = queue
+        self._measures = Measures(queue.redis)
         self._store = store
         self._limits = limits
         self._setup = child.Setup(
@@ -146,16 +156,18 @@ class Supervisor:
             started=time.time(),
         )
         self._child: Child | None = None
+        self._output = Output()
 
     def run(self, stop: threading.Event) -> None:
         """Works until told to stop; a task in hand is handed back."""
+        structlog.contextvars.bind_contextvars(worker=self.info.name)
         try:
             while not stop.is_set():
                 try:
                     task = self._queue.claim(self.info)
                 except RedisError as error:
                     # Away, loading, or its disk is full: it comes back, and we are here then.
-                    log.warning("no tasks to be had: %s", error)
+                    log.warning("no tasks to be had", reason=str(error))
                     task = None
                 if task is None:
                     stop.wait(IDLE * random.uniform(0.5, 1.5))
@@ -169,30 +181,65 @@ class Supervisor:
             self._drop_child()
 
     def _attempt(self, task: Task, stop: threading.Event) -> None:
-        log.info("%s, attempt %d", task, task.attempt)
         try:
             job = self._store.job(task.job)
             if job is None:
-                raise ChildLostError(f"{self._store.root}: has no job {task.job}")
+                raise FileNotFoundError(f"{self._store.root}: has no job {task.job}")
+        except OSError as error:
+            log.warning("cannot begin", job=task.job, task=task.label, reason=str(error))
+            self._tell(task, child.Failed(str(error), Cause.DISK), stop)
+            return
+        frame = job.shot.frame_numbers[task.frame]
+        with structlog.contextvars.bound_contextvars(
+            job=task.job, frame=frame, task=task.label, attempt=task.attempt
+        ):
+            begun = time.monotonic()
+            log.info("begun")
+            outcome = self._do(job, frame, task, stop)
+            self._note(task, outcome, time.monotonic() - begun)
+            self._tell(task, outcome, stop)
+
+    def _do(
+        self, job: Job, frame: int, task: Task, stop: threading.Event
+    ) -> child.Finished | child.Failed | None:
+        """Has the child do a task; whatever becomes of the child is the task's outcome."""
+        try:
             if self._child is None:
-                self._child = Child(self._setup)
-            self._child.order(
-                child.Order(job, job.shot.frame_numbers[task.frame], task.kind, task.part)
-            )
-            outcome = self._watch(self._child, task, stop)
+                self._child = Child(self._setup, self._output)
+            self._child.order(child.Order(job, frame, task.kind, task.part))
+            return self._watch(self._child, task, stop)
         except (ChildLostError, OSError) as error:
             self._drop_child()
-            outcome = child.Failed(str(error))
+            return child.Failed(str(error), getattr(error, "cause", Cause.DISK))
+
+    def _note(
+        self, task: Task, outcome: child.Finished | child.Failed | None, seconds: float
+    ) -> None:
+        """Tells the attempt's log and the farm's counters how it went."""
+        told: dict[str, Any] = {"seconds": round(seconds, 3)}
+        if output := self._output.take():
+            told["output"] = output
+        if isinstance(outcome, child.Failed):
+            log.warning("failed", cause=str(outcome.cause), reason=outcome.reason, **told)
+        else:
+            log.info("done" if outcome else "given up", **told)
+        try:
+            self._measures.add(account(task.kind, outcome, seconds, self._limits.threads))
+        except RedisError as error:
+            log.info("not counted", reason=str(error))
+
+    def _tell(
+        self, task: Task, outcome: child.Finished | child.Failed | None, stop: threading.Event
+    ) -> None:
         try:
             if isinstance(outcome, child.Finished):
                 tell = self._queue.complete
                 if not self._insist(stop)(tell, task, self.info.name, outcome.result):
-                    log.warning("%s: done, but another has the lease; the file counts", task)
+                    log.warning("done, but another has the lease; the file counts")
             elif isinstance(outcome, child.Failed):
-                log.warning("%s: %s", task, outcome.reason)
                 self._insist(stop)(self._queue.fail, task, self.info.name, outcome.reason)
         except RetryError:
-            log.warning("%s: Redis was not there to be told", task)
+            log.warning("Redis was not there to be told")
 
     def _watch(
         self, renderer: Child, task: Task, stop: threading.Event
@@ -202,6 +249,7 @@ class Supervisor:
         renewal, look = time.monotonic(), time.monotonic() + LOOK
         while True:
             message = renderer.hear(0.1)
+            self._output.drain()
             if isinstance(message, child.Finished | child.Failed):
                 return message
             if message is not None:
@@ -216,7 +264,7 @@ class Supervisor:
                     renewal = now + RENEWAL
                     told = self.info.model_copy(update={"task": task, "samples": samples})
                     if not self._queue.renew(task, told):
-                        log.warning("%s: another has the lease; dropped", task)
+                        log.warning("another has the lease; dropped")
                         self._stop_child(renderer)
                         return None
                 if now >= look:
@@ -227,14 +275,15 @@ class Supervisor:
                         return None
             except RedisError as error:
                 # The work stays good: the lease is renewed, or found lost, when Redis is back.
-                log.warning("going on with %s: %s", task, error)
+                log.warning("going on without Redis", reason=str(error))
                 if stop.is_set():
                     return None
             used = renderer.memory()
             if used > self._limits.memory_bytes:
                 raise ChildLostError(
                     f"the render process used {used >> 20} MiB of memory, over the "
-                    f"{self._limits.memory_bytes >> 20} MiB it may; give the worker more"
+                    f"{self._limits.memory_bytes >> 20} MiB it may; give the worker more",
+                    Cause.MEMORY,
                 )
 
     def _insist(self, stop: threading.Event) -> Retrying:
@@ -243,7 +292,7 @@ class Supervisor:
             retry=retry_if_exception_type(RedisError),
             wait=wait_random_exponential(max=2),
             stop=stop_when_event_set(stop),
-            before_sleep=before_sleep_log(log, logging.WARNING),
+            before_sleep=before_sleep_log(logging.getLogger(__name__), logging.WARNING),
         )
 
     def _stop_child(self, renderer: Child) -> None:

@@ -1,5 +1,6 @@
 """What a render child does: plans a frame, renders a part of one, merges one."""
 
+import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -44,6 +45,7 @@ class Work:
     part: int
     paths: PathMap
     control: core.Control = field(default_factory=core.Control)
+    phases: dict[str, float] = field(default_factory=dict)
 
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
@@ -81,15 +83,16 @@ class Work:
         shot = self.job.shot
         view, transport = self._scene(cache), scene.make_transport(shot)
         size = (shot.image.width, shot.image.height)
-        cost = planning.measure(
-            view,
-            transport,
-            size,
-            seed=shot.sampling.seed,
-            frame=self.frame,
-            threads=self.threads,
-            control=self.control,
-        )
+        with self._phase("plan"):
+            cost = planning.measure(
+                view,
+                transport,
+                size,
+                seed=shot.sampling.seed,
+                frame=self.frame,
+                threads=self.threads,
+                control=self.control,
+            )
         parts, empty = planning.cut(view, cost, size, shot.sampling.samples, self.task_seconds)
         return Plan(
             frame=self.frame,
@@ -108,7 +111,8 @@ class Work:
             self._read_ahead()
             path.parent.mkdir(parents=True, exist_ok=True)
             partial = self._samples(view, part.bucket, part.samples)
-            partial.write(str(path), plan.identity)
+            with self._phase("write"):
+                partial.write(str(path), plan.identity)
         return Rendered(samples=part.pixel_samples)
 
     def _merge(self, files: FrameStore, plan: Plan) -> Merged:
@@ -122,21 +126,23 @@ class Work:
             shot.image.width, shot.image.height, [(bucket, samples) for bucket in buckets]
         )
         redo, trouble = [], ""
-        for index, part in enumerate(plan.parts):
-            try:
-                partial = _read(files.part(part), plan.identity)
-            except core.InputError as error:
-                redo.append(index)
-                trouble = str(error)
-            else:
-                # After a gap the frame takes no more; the others are still looked through.
-                if not redo:
-                    frame.add(partial)
+        with self._phase("merge"):
+            for index, part in enumerate(plan.parts):
+                try:
+                    partial = _read(files.part(part), plan.identity)
+                except core.InputError as error:
+                    redo.append(index)
+                    trouble = str(error)
+                else:
+                    # After a gap the frame takes no more; the others are still looked through.
+                    if not redo:
+                        frame.add(partial)
         if redo:
             return Merged(redo=redo, reason=trouble)
         for partial in self._empty_buckets(plan):
             frame.add(partial)
-        self._write(files, frame, time.time() - plan.begun)
+        with self._phase("write"):
+            self._write(files, frame, time.time() - plan.begun)
         return Merged()
 
     def _empty_buckets(self, plan: Plan) -> Iterator[core.Partial]:
@@ -173,22 +179,33 @@ class Work:
         now = scene.cache_of(self.job.shot, self.frame, self.paths)
         if now != cache:
             raise InputError(f"{cache.path}: has changed since its frame was planned; submit again")
-        volume = self.caches.get(cache, self.job.shot.volumes[0].density)
+        with self._phase("load"):
+            volume = self.caches.get(cache, self.job.shot.volumes[0].density)
         return scene.make_scene(self.paths.shot(self.job.shot), self.frame, volume)
 
     def _samples(self, view: core.Scene, bucket: Bucket, samples: tuple[int, int]) -> core.Partial:
         shot = self.job.shot
-        return core.render(
-            view,
-            scene.make_transport(shot),
-            bucket=bucket,
-            samples=samples,
-            seed=shot.sampling.seed,
-            frame=self.frame,
-            orders=shot.image.orders,
-            threads=self.threads,
-            control=self.control,
-        )
+        with self._phase("render"):
+            return core.render(
+                view,
+                scene.make_transport(shot),
+                bucket=bucket,
+                samples=samples,
+                seed=shot.sampling.seed,
+                frame=self.frame,
+                orders=shot.image.orders,
+                threads=self.threads,
+                control=self.control,
+            )
+
+    @contextlib.contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        """Adds the seconds of a block to a phase of the task."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.phases[name] = self.phases.get(name, 0.0) + time.perf_counter() - begun
 
     def _read_ahead(self) -> None:
         """Begins to read the next frame's cache; if that cannot be, its own task will say so."""

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from pileus_service import logs
 from pileus_worker.embedded import embedded_farm
 
 app = typer.Typer()
@@ -25,6 +26,7 @@ def up(
     listen: Annotated[str, typer.Option(metavar="HOST:PORT")] = "127.0.0.1:8765",
 ) -> None:
     """Runs a whole farm on this machine: Redis, service and workers. Ctrl-C ends all of it."""
+    logs.configure()
     stop = threading.Event()
     # Before anything starts, so that no signal finds half a farm.
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,6 +1,5 @@
 """`pileus worker`: one worker, until it is told to stop."""
 
-import logging
 import signal
 import threading
 from pathlib import Path
@@ -8,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from pileus_service import logs
 from pileus_service.errors import InputError
+from pileus_service.framelog import FrameLog
 from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
 from pileus_service.store import Store
@@ -50,7 +51,8 @@ def worker(
     ] = TASK_SECONDS,
 ) -> None:
     """Runs one worker: takes tasks from Redis until it gets SIGTERM or Ctrl-C."""
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    store = Store(data.resolve())
+    logs.configure(FrameLog(store))
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -62,4 +64,4 @@ def worker(
         raise InputError(f"--redis {redis}: {error}") from None
     roots = Roots(root or [Path.cwd()])
     paths = PathMap.parse(maps or [])
-    Supervisor(queue, Store(data.resolve()), tuple(roots.folders), limits, paths).run(stop)
+    Supervisor(queue, store, tuple(roots.folders), limits, paths).run(stop)

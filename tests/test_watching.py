@@ -1,0 +1,109 @@
+"""What the farm tells of itself: attempts' logs and counters."""
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pileus_core as core
+import pytest
+import structlog
+
+from pileus_service import framelog, logs
+from pileus_service.client import Client
+from pileus_service.jobs import Job, Wish
+from pileus_service.shot import Shot
+from pileus_service.store import Store
+from pileus_worker.embedded import EmbeddedFarm, embedded_farm
+
+PILEUS = str(Path(sys.executable).with_name("pileus"))
+
+
+@pytest.fixture
+def one_frame(shot: dict[str, Any], tmp_path: Path) -> Shot:
+    (tmp_path / "caches").mkdir()
+    core.make_cloud(str(tmp_path / "caches" / "cloud.0001.vdb"), frame=1, frames=1, resolution=48)
+    shot |= {"frames": "1", "sampling": {"samples": 1 << 18}}
+    return Shot.model_validate(shot)
+
+
+@pytest.fixture
+def farm(tmp_path: Path) -> Iterator[EmbeddedFarm]:
+    with embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0", 0.2) as farm:
+        yield farm
+
+
+def render_child(worker: int) -> int:
+    """The render process of a worker; its other child keeps multiprocessing's accounts."""
+    children = Path(f"/proc/{worker}/task/{worker}/children").read_text().split()
+    [child] = [
+        pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    ]
+    return int(child)
+
+
+def test_a_crashed_attempt_is_told_in_its_frames_log_and_counted(
+    farm: EmbeddedFarm, one_frame: Shot
+) -> None:
+    with Client(farm.url) as client:
+        job = client.submit(one_frame).job.id
+        end = time.monotonic() + 60
+        while not (busy := [w for w in client.workers() if w.task and w.task.kind == "render"]):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        os.kill(render_child(busy[0].pid), signal.SIGSEGV)
+        while not (failed := [line for line in client.log(job, 1) if line.event == "failed"]):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        client.control(job, "cancel")
+    [line] = failed
+    assert (line.worker, line.cause, line.attempt) == (busy[0].name, "crash", 1)
+    assert line.task.startswith("render")
+    assert "signal 11" in (line.reason or "")
+    assert "Segmentation fault" in (line.output or "")
+    command = [PILEUS, "log", job, "1", "--server", farm.url]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "Segmentation fault" in printed
+    assert printed.index("plan") < printed.index("signal 11")
+    metrics = httpx.get(f"{farm.url}/metrics").text
+    assert 'pileus_attempt_failures_total{cause="crash"} 1.0' in metrics
+    assert 'pileus_attempts_total{kind="plan",outcome="done"} 1.0' in metrics
+
+
+def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame: Shot) -> None:
+    store = Store(tmp_path / "data")
+    store.create(Job(id="j", created=0, shot=one_frame), Wish())
+    record = logging.LogRecord("n", logging.INFO, "", 0, "", None, None)
+    handler = framelog.FrameLog(store)
+    with structlog.contextvars.bound_contextvars(job="j", frame=1, worker="w", task="merge"):
+        for number in range(1000):
+            record.msg = f"{number} {'x' * 1000}"
+            handler.emit(record)
+    folder = store.frame("j", 1).logs
+    kept = sum(path.stat().st_size for path in folder.iterdir())
+    assert kept < 2 * (framelog.FILE_BYTES + 2000)
+    lines = framelog.read(folder, 50)
+    assert [int(line.event.split()[0]) for line in lines] == list(range(950, 1000))
+
+
+def test_every_line_says_what_it_is_about(capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of libraries too, which know nothing of structlog."""
+    before = logging.root.handlers[:]
+    try:
+        logs.configure()
+        with structlog.contextvars.bound_contextvars(job="j", frame=3, task="plan", worker="w"):
+            structlog.stdlib.get_logger().info("ours", seconds=1.5)
+            logging.getLogger("theirs").warning("with %s", "arguments")
+    finally:
+        logging.root.handlers[:] = before
+    ours, theirs = map(json.loads, capsys.readouterr().err.splitlines())
+    about = {"job": "j", "frame": 3, "task": "plan", "worker": "w"}
+    assert ours.items() >= {**about, "event": "ours", "seconds": 1.5, "level": "info"}.items()
+    assert theirs.items() >= {**about, "event": "with arguments", "level": "warning"}.items()
