@@ -15,10 +15,10 @@ from redis.exceptions import RedisError
 from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
 
-from pileus_service import __version__, framelog, metrics, problems
+from pileus_service import __version__, framelog, metrics, pages, problems
 from pileus_service.auth import Guard
 from pileus_service.farm import ConflictError, Farm
-from pileus_service.jobs import JOB_ID, TERMINAL, FrameView, JobView, WorkerView
+from pileus_service.jobs import JOB_ID, TERMINAL, FrameMap, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted, Change, Submission
 from pileus_service.problems import Problem
 
@@ -61,11 +61,12 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
     app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
     problems.install(app)
     app.add_middleware(problems.BodyLimit, limit=MAX_BODY)
+    pages.install(app)
     app.include_router(_jobs(farm), prefix="/v1", dependencies=[Depends(guard)])
 
     @app.get("/v1/workers", dependencies=[Depends(guard)], tags=["farm"])
     def workers() -> list[WorkerView]:
-        return farm.queue.workers()
+        return farm.workers()
 
     @app.get("/metrics", dependencies=[Depends(guard)], tags=["farm"])
     def prometheus() -> Response:
@@ -110,6 +111,11 @@ def _jobs(farm: Farm) -> APIRouter:
     @router.get("/{job_id}/frames")
     def frames(job_id: Id, limit: Limit = 100, offset: Offset = 0) -> list[FrameView]:
         return _found(farm.frames(job_id, limit, offset), job_id)
+
+    @router.get("/{job_id}/map")
+    def frame_map(job_id: Id) -> FrameMap:
+        """The state of every frame, a letter each."""
+        return _found(farm.frame_map(job_id), job_id)
 
     @router.get("/{job_id}/frames/{frame}/preview.png", response_class=FileResponse)
     def preview(job_id: Id, frame: FrameNumber) -> FileResponse:

@@ -11,17 +11,15 @@ from typing import Annotated, Any, Literal
 import typer
 from pydantic import BaseModel
 from rich.console import Console
-from rich.table import Table
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pileus_service import __version__
+from pileus_service import __version__, terminal
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.jobs import JobState
-from pileus_service.progress import duration
 from pileus_service.shotfile import load_shot
-from pileus_service.watching import describe, wait_for
+from pileus_service.watching import picture, show_until_ended, wait_for
 
 Server = Annotated[
     str, typer.Option(envvar="PILEUS_SERVER", help="The service's address.", metavar="URL")
@@ -124,37 +122,27 @@ def list_jobs(server: Server = LOCAL, token: Token = None, as_json: AsJson = Fal
     if as_json:
         _print_json(jobs)
         return
-    table = _table("job", "name", "state", "priority", "frames", "done", "left")
-    for job in jobs:
-        frames = f"{job.frames_done} of {job.frames}"
-        left = duration(job.seconds_left)
-        table.add_row(
-            job.id, job.name, job.state, str(job.priority), frames, f"{job.progress:.0%}", left
-        )
-    Console().print(table)
+    Console().print(terminal.job_table(jobs))
 
 
 @app.command()
 def status(
-    job: JobArgument, server: Server = LOCAL, token: Token = None, as_json: AsJson = False
+    job: JobArgument,
+    server: Server = LOCAL,
+    token: Token = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Shows it until the job ends.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Shows a job and its frames."""
+    """Shows a job: its frames as a grid, what is in flight, the time left."""
     with Client(server, token) as client:
-        view, frames = client.job(job), list(client.frames(job))
-    if as_json:
-        told = view.model_dump(mode="json")
-        told["frames_list"] = [frame.model_dump(mode="json") for frame in frames]
-        print(json.dumps(told))
-        return
-    print(f"{view.id} {view.name}: {view.state}, {describe(view)}")
-    table = _table("frame", "state", "done", "seconds", "")
-    for frame in frames:
-        seconds = f"{frame.seconds:.1f}" if frame.seconds is not None else ""
-        told_by = frame.file if frame.state == "done" else frame.reason
-        table.add_row(
-            str(frame.frame), frame.state, f"{frame.progress:.0%}", seconds, told_by or ""
-        )
-    Console().print(table)
+        if as_json:
+            told = client.job(job).model_dump(mode="json")
+            told["frames_list"] = [frame.model_dump(mode="json") for frame in client.frames(job)]
+            print(json.dumps(told))
+        elif watch:
+            show_until_ended(client, job)
+        else:
+            Console().print(picture(client, client.job(job)))
 
 
 @app.command("log")
@@ -203,14 +191,11 @@ def workers(server: Server = LOCAL, token: Token = None, as_json: AsJson = False
     """Lists the workers and what they do."""
     with Client(server, token) as client:
         seen = client.workers()
+        names = {job.id: job.name for job in client.jobs()}
     if as_json:
         _print_json(seen)
         return
-    table = _table("worker", "alive", "threads", "task")
-    for worker in seen:
-        task = str(worker.task) if worker.task else ""
-        table.add_row(worker.name, "yes" if worker.alive else "no", str(worker.threads), task)
-    Console().print(table)
+    Console().print(terminal.worker_table(seen, names))
 
 
 @app.command()
@@ -230,13 +215,6 @@ def service(
     from pileus_service.server import serve  # a client need not load it
 
     serve(data, redis, root or [Path.cwd()], listen)
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column, no_wrap=column == "job")
-    return table
 
 
 def _print_json(thing: BaseModel | list[Any]) -> None:

@@ -11,7 +11,7 @@ from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_rand
 
 from pileus_service.errors import FarmError, InputError
 from pileus_service.framelog import LogLine
-from pileus_service.jobs import TERMINAL, FrameView, JobView, WorkerView
+from pileus_service.jobs import TERMINAL, FrameMap, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted
 from pileus_service.shot import Shot
 
@@ -61,6 +61,16 @@ class Client:
             if len(page) < 1000:
                 return
             offset += len(page)
+
+    def frame(self, job: str, index: int) -> FrameView:
+        """One frame, by its place in the job."""
+        page = {"limit": 1, "offset": index}
+        answer = self._ask("GET", f"/jobs/{job}/frames", params=page)
+        [frame] = TypeAdapter(list[FrameView]).validate_json(answer.content)
+        return frame
+
+    def frame_map(self, job: str) -> FrameMap:
+        return FrameMap.model_validate_json(self._ask("GET", f"/jobs/{job}/map").content)
 
     def log(self, job: str, frame: int) -> list[LogLine]:
         answer = self._ask("GET", f"/jobs/{job}/frames/{frame}/log")

@@ -8,13 +8,17 @@ import structlog
 from pileus_service.errors import InputError
 from pileus_service.jobs import (
     TERMINAL,
+    Doing,
     Done,
+    FrameMap,
     FrameView,
     Job,
     JobState,
     JobView,
+    Kind,
     Priority,
     Wish,
+    WorkerView,
     id_for_key,
     new_id,
 )
@@ -136,6 +140,49 @@ class Farm:
                     FrameView(frame=number, state="cancelled" if cancelled else "waiting")
                 )
         return frames
+
+    def frame_map(self, job_id: str) -> FrameMap | None:
+        """Every frame's state, from Redis alone: cheap enough to be asked for often."""
+        job, view = self.store.job(job_id), self.job(job_id)
+        if job is None or view is None:
+            return None
+        active = {frame.frame: frame.state[0] for frame in view.active}
+        letters = ["c" if view.state is JobState.CANCELLED else "."] * view.frames
+        for index in self.queue.done(job_id):
+            letters[index] = "d"
+        for index in self.queue.failed(job_id):
+            letters[index] = "f"
+        for index, number in enumerate(job.shot.frame_numbers):
+            letters[index] = active.get(number, letters[index])
+        image = job.shot.image
+        return FrameMap(
+            frames=job.shot.frames,
+            states="".join(letters),
+            width=image.width,
+            height=image.height,
+        )
+
+    def workers(self) -> list[WorkerView]:
+        """The workers, each with its task in a user's words."""
+        return [
+            worker.model_copy(update={"doing": self._doing(worker)}) if worker.alive else worker
+            for worker in self.queue.workers()
+        ]
+
+    def _doing(self, worker: WorkerView) -> Doing | None:
+        task = worker.task
+        job = self.store.job(task.job) if task else None
+        if task is None or job is None:
+            return None
+        frame = job.shot.frame_numbers[task.frame]
+        doing = Doing(job=task.job, frame=frame, kind=task.kind)
+        plan = self.store.frame(task.job, frame).plan() if task.kind is Kind.RENDER else None
+        if plan is None or task.part >= len(plan.parts):
+            return doing
+        part = plan.parts[task.part]
+        progress = min(1.0, worker.samples / max(1, part.pixel_samples))
+        told = {"bucket": part.bucket, "samples": part.samples, "progress": progress}
+        return doing.model_copy(update=told)
 
     def done(self, job_id: str, frame: int) -> Done | None:
         return self.store.frame(job_id, frame).done() if self.store.job(job_id) else None

@@ -182,11 +182,23 @@ class WorkerInfo(Record):
     samples: int = 0
 
 
+class Doing(Record):
+    """A worker's task in a user's words: the frame by its number, what of it, how far."""
+
+    job: JobId
+    frame: int
+    kind: Kind
+    bucket: Bucket | None = None
+    samples: tuple[int, int] | None = None
+    progress: float = 0.0
+
+
 class WorkerView(WorkerInfo):
     """A worker as the service shows it."""
 
     seen: float
     alive: bool
+    doing: Doing | None = None
 
 
 class FrameView(Record):
@@ -200,6 +212,17 @@ class FrameView(Record):
     reason: str | None = None
     file: str | None = None
     seconds: float | None = None
+
+
+class FrameMap(Record):
+    """The state of every frame of a job, a letter each, in rising order of `frames`: waiting (.),
+    planning, rendering, merging, done, failed, cancelled (their first letters). `width` and
+    `height` are the image's, in pixels."""
+
+    frames: str
+    states: str
+    width: int
+    height: int
 
 
 class JobView(Record):

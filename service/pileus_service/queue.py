@@ -7,7 +7,7 @@ flight: `pileus_service.store` is the truth.
 
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.resources import files
 from typing import Any, Literal, cast
 
@@ -148,6 +148,18 @@ class Queue:
         """Reason by frame index."""
         held = cast(dict[str, str], self.redis.hgetall(f"pileus:job:{job}:failed"))
         return {int(frame): reason for frame, reason in held.items()}
+
+    def done(self, job: str) -> set[int]:
+        """The indices of the frames that are done."""
+        ask = cast(Callable[..., bytes | None], self.redis.execute_command)
+        return {
+            8 * index + bit
+            for index, byte in enumerate(
+                ask("GET", f"pileus:job:{job}:done", NEVER_DECODE=True) or b""
+            )
+            for bit in range(8)
+            if byte & 0x80 >> bit
+        }
 
     def active(self, job: str, workers: list[WorkerView]) -> dict[int, FrameView]:
         """The frames in flight, by index (which stands in their `frame` too)."""

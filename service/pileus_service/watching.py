@@ -1,8 +1,14 @@
 """Follows a job until it ends, with progress."""
 
+from rich.console import Console, Group
+from rich.live import Live
+
+from pileus_service import terminal
 from pileus_service.client import Client
+from pileus_service.frames import parse_frames
 from pileus_service.jobs import FrameView, JobView
-from pileus_service.progress import Display, Row, duration
+from pileus_service.progress import Display, Row
+from pileus_service.terminal import describe
 
 
 def wait_for(client: Client, job: JobView) -> JobView:
@@ -21,14 +27,18 @@ def _frame_row(frame: FrameView) -> Row:
     return Row(f"  frame {frame.frame}", frame.progress, f"{frame.state} {tasks}")
 
 
-def describe(job: JobView) -> str:
-    """How far a job is."""
-    text = f"{job.frames_done} of {job.frames} frames"
-    if job.frames_failed:
-        text += f", {job.frames_failed} failed"
-    text += f", {job.samples / 1e6:.1f} M samples"
-    if job.seconds_left is not None:
-        text += f", {duration(job.seconds_left)} left"
-    elif job.finished and job.started:
-        text += f", took {duration(job.finished - job.started)}"
-    return text
+def picture(client: Client, job: JobView) -> Group:
+    """A job with its frames and the workers that are at it."""
+    frame_map = client.frame_map(job.id)
+    numbers = parse_frames(frame_map.frames)
+    wrong = [index for index, state in enumerate(frame_map.states) if state == "f"]
+    failed = [client.frame(job.id, index) for index in wrong[: terminal.MOST_REASONS]]
+    failed += [FrameView(frame=numbers[i], state="failed") for i in wrong[terminal.MOST_REASONS :]]
+    return terminal.job_picture(job, frame_map, failed, client.workers())
+
+
+def show_until_ended(client: Client, job: str) -> None:
+    """Draws a job anew twice a second until it ends."""
+    with Live(console=Console(), auto_refresh=False) as live:
+        for view in client.watch(job):
+            live.update(picture(client, view), refresh=True)
