@@ -59,8 +59,7 @@ def bar(fraction: float, state: str, width: int | None = 24) -> ProgressBar:
 
 def job_table(jobs: Iterable[JobView]) -> Table:
     """A line a job, the newest first as they come."""
-    table = _table("job", "name", "state", "prio", "frames", "", "time")
-    table.columns[1].overflow = "ellipsis"
+    table = _table("job", "name", "state", "prio", "frames", "done", "time")
     for job in jobs:
         table.add_row(
             job.id,
@@ -68,7 +67,7 @@ def job_table(jobs: Iterable[JobView]) -> Table:
             state_text(job.state),
             str(job.priority),
             f"{job.frames_done}/{job.frames}",
-            bar(job.progress, job.state, 8),
+            f"{job.progress:.0%}",
             time_text(job),
         )
     return table
@@ -165,5 +164,5 @@ def _ago(when: float) -> str:
 def _table(*columns: str) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bright_black")
     for column in columns:
-        table.add_column(column, no_wrap=True)
+        table.add_column(column, no_wrap=column not in ("name", "task"))
     return table
