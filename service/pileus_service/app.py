@@ -52,11 +52,12 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        keeper = asyncio.create_task(keep_true())
+        keepers = [asyncio.create_task(keep_true()), asyncio.create_task(farm.hooks.deliver())]
         yield
-        keeper.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await keeper
+        for keeper in keepers:
+            keeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await keeper
 
     app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
     problems.install(app)
@@ -91,7 +92,7 @@ def _jobs(farm: Farm) -> APIRouter:
     def submit(body: Submission, response: Response, idempotency_key: Key = None) -> Accepted:
         """Takes a shot. The same Idempotency-Key with the same shot is the same job."""
         try:
-            job, new = farm.submit(body.shot, body.priority, idempotency_key)
+            job, new = farm.submit(body.shot, body.priority, idempotency_key, body.webhook)
         except ConflictError as error:
             raise Problem(409, str(error)) from None
         if not new:

@@ -94,13 +94,16 @@ def submit(
     ] = None,
     priority: Annotated[int, typer.Option(min=0, max=9, help="The higher the sooner.")] = 5,
     key: Annotated[str | None, typer.Option(help="Idempotency key: submit once.")] = None,
+    webhook: Annotated[
+        str | None, typer.Option(metavar="URL", help="Told when the job has ended.")
+    ] = None,
     wait: Annotated[bool, typer.Option("--wait", help="Waits until it ends.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Sends a shot to the farm."""
     settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
     with Client(server, token) as client:
-        accepted = client.submit(load_shot(shot, settings), priority, key)
+        accepted = client.submit(load_shot(shot, settings), priority, key, webhook)
         for warning in accepted.warnings:
             print(f"{shot}: warning: {warning}", file=sys.stderr)
         job = accepted.job

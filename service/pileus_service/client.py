@@ -37,8 +37,10 @@ class Client:
     ) -> None:
         self._http.close()
 
-    def submit(self, shot: Shot, priority: int = 5, key: str | None = None) -> Accepted:
-        body = {"shot": shot.model_dump(mode="json"), "priority": priority}
+    def submit(
+        self, shot: Shot, priority: int = 5, key: str | None = None, webhook: str | None = None
+    ) -> Accepted:
+        body = {"shot": shot.model_dump(mode="json"), "priority": priority, "webhook": webhook}
         headers = {"Idempotency-Key": key} if key else {}
         answer = self._ask("POST", "/jobs", json=body, headers=headers)
         return Accepted.model_validate_json(answer.content)

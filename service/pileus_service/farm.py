@@ -27,6 +27,7 @@ from pileus_service.roots import Roots
 from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files
 from pileus_service.store import Store
+from pileus_service.webhooks import Webhooks, hooks_from_environment
 
 log = structlog.stdlib.get_logger(__name__)
 
@@ -40,20 +41,32 @@ class ConflictError(InputError):
 class Farm:
     """Submits, steers and shows jobs. Disk first, Redis second: `reconcile` mends the rest."""
 
-    def __init__(self, store: Store, queue: Queue, roots: Roots) -> None:
+    def __init__(
+        self, store: Store, queue: Queue, roots: Roots, hooks: Webhooks | None = None
+    ) -> None:
         self.store = store
         self.queue = queue
         self.roots = roots
+        self.hooks = hooks or hooks_from_environment(store.root)
         self._lock = threading.RLock()
         self._wishes: dict[str, Wish] = {}
 
-    def submit(self, shot: Shot, priority: Priority, key: str | None) -> tuple[JobView, bool]:
+    def submit(
+        self, shot: Shot, priority: Priority, key: str | None, webhook: str | None = None
+    ) -> tuple[JobView, bool]:
         """Takes a shot in; with a key, once. Returns the job and whether it is new."""
         shot = shot.anchored(self.roots.first)
         numbers = shot.frame_numbers
         self.roots.check(shot, numbers)
         check_files(shot, shot.name, numbers)
-        job = Job(id=id_for_key(key) if key else new_id(), created=time.time(), shot=shot)
+        if webhook is not None:
+            self.hooks.check(webhook)
+        job = Job(
+            id=id_for_key(key) if key else new_id(),
+            created=time.time(),
+            shot=shot,
+            webhook=webhook,
+        )
         wish = Wish(priority=priority)
         new = self.store.create(job, wish)
         if not new:
@@ -237,6 +250,10 @@ class Farm:
             log.info("ended", job=job_id, state=state, failed=len(wish.failed))
 
     def _keep(self, job_id: str, wish: Wish) -> None:
+        job = self.store.job(job_id) if wish.state in TERMINAL else None
+        if job is not None:
+            # First the notice: an end that is on disk is not looked at again.
+            self.hooks.note_end(job, wish)
         self.store.wish(job_id, wish)
         self._wishes[job_id] = wish
 

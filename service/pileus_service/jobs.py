@@ -60,6 +60,7 @@ class Job(Record):
     id: JobId
     created: float
     shot: Shot
+    webhook: str | None = None
 
 
 class Wish(Record):
