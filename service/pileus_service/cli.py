@@ -14,10 +14,11 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pileus_service import __version__, terminal
+from pileus_service import __version__, doctor, terminal
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.jobs import JobState
+from pileus_service.queue import connect
 from pileus_service.shotfile import load_shot
 from pileus_service.watching import picture, show_until_ended, wait_for
 
@@ -199,6 +200,40 @@ def workers(server: Server = LOCAL, token: Token = None, as_json: AsJson = False
         _print_json(seen)
         return
     Console().print(terminal.worker_table(seen, names))
+
+
+@app.command("doctor")
+def look_at_health(
+    data: Annotated[
+        Path | None, typer.Option(envvar="PILEUS_DATA", help="Looks at the farm's folder.")
+    ] = None,
+    redis: Annotated[
+        str | None, typer.Option(envvar="PILEUS_REDIS", help="Looks at Redis.", metavar="URL")
+    ] = None,
+    root: Annotated[
+        list[Path] | None, typer.Option(help="Looks at a folder that shots use; repeatable.")
+    ] = None,
+    server: Annotated[
+        str | None,
+        typer.Option(envvar="PILEUS_SERVER", help="Looks at the service.", metavar="URL"),
+    ] = None,
+    token: Token = None,
+    as_json: AsJson = False,
+) -> None:
+    """Looks at this host and at what it is told of the farm, and says what to mend."""
+    findings = [*doctor.host()]
+    if data or root:
+        findings += doctor.folders(data, root or [])
+    if redis:
+        findings += doctor.redis(connect(redis))
+    if server:
+        findings += doctor.service(server, token)
+    if as_json:
+        _print_json(findings)
+    else:
+        Console().print(terminal.finding_table(findings))
+    if wrong := sum(finding.level == "wrong" for finding in findings):
+        raise FarmError(f"{wrong} of {len(findings)} are wrong")
 
 
 @app.command()

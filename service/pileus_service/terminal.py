@@ -9,6 +9,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from pileus_service.doctor import Finding
 from pileus_service.frames import parse_frames
 from pileus_service.jobs import FrameMap, FrameView, JobState, JobView, WorkerView
 from pileus_service.progress import duration
@@ -125,6 +126,19 @@ def job_picture(
     if failed:
         parts.append(Text("`pileus log JOB FRAME` has the attempts", "bright_black"))
     return Group(*parts)
+
+
+def finding_table(findings: Iterable[Finding]) -> Table:
+    """What the doctor found, with the mends below what wants one."""
+    marks = {"ok": ("✓", "green"), "warning": ("!", "yellow"), "wrong": ("✗", "red")}
+    table = Table.grid(padding=(0, 2))
+    for finding in findings:
+        mark, style = marks[finding.level]
+        found = Text(finding.found)
+        if finding.mend:
+            found.append(f"\n{finding.mend}", style)
+        table.add_row(Text(mark, style), finding.what, found)
+    return table
 
 
 def _grid(frame_map: FrameMap) -> Group:

@@ -32,8 +32,6 @@ def up(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with embedded_farm(data, root or [Path.cwd()], workers, listen) as farm:
-        print(
-            f"The farm is up: {farm.url} (API at {farm.url}/docs), {workers} worker(s)", flush=True
-        )
+        print(f"The farm is up: {farm.url} (a page, and the API), {workers} worker(s)", flush=True)
         stop.wait()
         print("Ending...", file=sys.stderr)

@@ -1,0 +1,66 @@
+"""`pileus doctor` on real folders and a real Redis: what is well, and what each wrong thing is."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from redis import Redis
+
+from pileus_service import doctor
+from pileus_worker.private_redis import PrivateRedis
+
+PILEUS = str(Path(sys.executable).with_name("pileus"))
+
+
+@pytest.fixture
+def own_redis(tmp_path: Path) -> Iterator[Redis]:
+    """One that a test may spoil."""
+    with PrivateRedis(tmp_path / "redis") as server, Redis.from_url(server.url) as client:
+        yield client
+
+
+def levels(findings: Iterator[doctor.Finding]) -> dict[str, str]:
+    return {finding.what: finding.level for finding in findings}
+
+
+def test_what_is_well_is_called_well(own_redis: Redis, tmp_path: Path) -> None:
+    for folder in ("data", "root"):
+        (tmp_path / folder).mkdir()
+    assert set(levels(doctor.host()).values()) == {"ok"}
+    found = levels(doctor.folders(tmp_path / "data", [tmp_path / "root"]))
+    assert (found["data folder"], found["root"]) == ("ok", "ok")
+    assert not list((tmp_path / "data").iterdir())
+    found = levels(doctor.redis(own_redis))
+    assert {found["Redis"], found["clock"], found["Redis when it is full"]} == {"ok"}
+
+
+def test_a_redis_that_may_forget_is_wrong(own_redis: Redis) -> None:
+    own_redis.config_set("maxmemory-policy", "allkeys-lru")
+    own_redis.config_set("appendonly", "no")
+    own_redis.config_set("maxmemory", 1 << 20)
+    found = levels(doctor.redis(own_redis))
+    assert found["Redis when it is full"] == "wrong"
+    assert found["Redis's memory of itself"] == "warning"
+    assert found["Redis's room"] == "warning"
+
+
+def test_a_root_that_holds_the_data_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    found = [each.level for each in doctor.folders(tmp_path / "data", [tmp_path])]
+    assert found[-1] == "warning"
+
+
+def test_what_is_not_there_is_named_with_a_mend(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    command = [PILEUS, "doctor", "--json", "--data", str(tmp_path / "file")]
+    command += ["--root", str(tmp_path / "none"), "--redis", "unix:///nowhere/redis"]
+    command += ["--server", "http://127.0.0.1:1"]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert ended.stderr.count("\n") == 1
+    wrong = {each["what"]: each for each in json.loads(ended.stdout) if each["level"] == "wrong"}
+    assert wrong.keys() == {"data folder", "root", "Redis", "service"}
+    assert all(each["mend"] for each in wrong.values())

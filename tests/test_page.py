@@ -1,0 +1,91 @@
+"""The page at `/`: it is whole by itself, asks only what the API answers, works in a browser."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pileus_core as core
+import pytest
+from fastapi.testclient import TestClient
+from redis import Redis
+
+from pileus_service.app import create_app
+from pileus_service.auth import Guard
+from pileus_service.client import Client
+from pileus_service.farm import Farm
+from pileus_service.queue import Queue
+from pileus_service.roots import Roots
+from pileus_service.shot import Shot
+from pileus_service.store import Store
+from pileus_worker.embedded import embedded_farm
+
+WEB = Path(__file__).parent.parent / "service" / "pileus_service" / "web"
+
+
+@pytest.fixture
+def client(redis: Redis, tmp_path: Path) -> TestClient:
+    farm = Farm(Store(tmp_path / "data"), Queue(redis), Roots([tmp_path]))
+    return TestClient(create_app(farm, Guard(None)), base_url="http://127.0.0.1")
+
+
+def test_the_page_is_whole_by_itself_and_can_be_fed_no_script(client: TestClient) -> None:
+    answer = client.get("/")
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert not re.search(r"<script(?![^>]*src=)|\son\w+=|\sstyle=|<style", answer.text)
+    linked = set(re.findall(r'(?:src|href)="([^"#]+)"', answer.text))
+    for file in WEB.iterdir():
+        text = file.read_text().replace("http://www.w3.org/2000/svg", "")
+        assert not re.search(r"https?://", text), file
+        assert "innerHTML" not in text, file  # names of jobs are a user's, and no markup
+        linked |= set(re.findall(r'from "([^"]+)"', text))
+    assert len(linked) >= 6
+    for address in linked:
+        assert client.get(address).is_success, address
+
+
+def test_the_page_asks_only_what_the_api_answers(client: TestClient) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    answered = [re.sub(r"\{\w+\}", "[^/]+", path) + r"(\?.*)?" for path in paths]
+    script = "".join(file.read_text() for file in WEB.glob("*.js"))
+    asked = {
+        re.sub(r"\$\{(?:[^{}]|\{[^{}]*\})*\}", "pause", address)
+        for address in re.findall(r"[`\"](/v1/[^`\"]*)[`\"]", script)
+    }
+    assert len(asked) >= 8
+    for address in asked:
+        assert any(re.fullmatch(path, address) for path in answered), address
+
+
+@pytest.mark.slow
+def test_the_page_shows_a_job_in_a_browser(tmp_path: Path, shot: dict[str, Any]) -> None:
+    browser = shutil.which("chromium")
+    if browser is None:
+        pytest.skip("no browser is here: apt-get install chromium")
+    (tmp_path / "caches").mkdir()
+    for frame in (1, 3):
+        path = tmp_path / "caches" / f"cloud.{frame:04d}.vdb"
+        core.make_cloud(str(path), frame=frame, frames=3, resolution=32)
+    (tmp_path / "caches" / "cloud.0002.vdb").write_bytes(b"no vdb")
+    named = Shot.model_validate(shot | {"name": "<b>cirrus</b>"})
+    with (
+        embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0") as farm,
+        Client(farm.url) as client,
+    ):
+        *_, job = client.watch(client.submit(named).job.id)
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+        command += ["--disable-background-networking", "--enable-logging=stderr"]
+        command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000"]
+        command.append(f"{farm.url}/#{job.id}")
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "CONSOLE" not in ended.stderr, ended.stderr
+    page = ended.stdout
+    assert "<h1>&lt;b&gt;cirrus&lt;/b&gt;</h1>" in page
+    grid = page[page.index('id="frames"') : page.index('class="key"')]
+    assert re.findall(r'<button[^>]*class="(\w+)"', grid) == ["done", "failed", "done"]
+    assert 'src="blob:' in page
+    assert "cloud.0002.vdb" in page
+    assert page.count("threads") + page.count("1 thread") >= 1
