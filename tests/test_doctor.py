@@ -33,7 +33,7 @@ def test_what_is_well_is_called_well(own_redis: Redis, tmp_path: Path) -> None:
     found = levels(doctor.folders(tmp_path / "data", [tmp_path / "root"]))
     assert (found["data folder"], found["root"]) == ("ok", "ok")
     assert not list((tmp_path / "data").iterdir())
-    found = levels(doctor.redis(own_redis))
+    found = levels(doctor.redis_server(own_redis))
     assert {found["Redis"], found["clock"], found["Redis when it is full"]} == {"ok"}
 
 
@@ -41,7 +41,7 @@ def test_a_redis_that_may_forget_is_wrong(own_redis: Redis) -> None:
     own_redis.config_set("maxmemory-policy", "allkeys-lru")
     own_redis.config_set("appendonly", "no")
     own_redis.config_set("maxmemory", 1 << 20)
-    found = levels(doctor.redis(own_redis))
+    found = levels(doctor.redis_server(own_redis))
     assert found["Redis when it is full"] == "wrong"
     assert found["Redis's memory of itself"] == "warning"
     assert found["Redis's room"] == "warning"

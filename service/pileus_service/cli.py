@@ -225,7 +225,7 @@ def look_at_health(
     if data or root:
         findings += doctor.folders(data, root or [])
     if redis:
-        findings += doctor.redis(connect(redis))
+        findings += doctor.redis_server(connect(redis))
     if server:
         findings += doctor.service(server, token)
     if as_json:

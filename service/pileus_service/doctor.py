@@ -158,15 +158,15 @@ def _data(data: Path) -> Iterator[Finding]:
     )
 
 
-def redis(client: "Redis") -> Iterator[Finding]:
+def redis_server(redis: "Redis") -> Iterator[Finding]:
     """Redis: that it is there, new and quick enough, and forgets nothing."""
     try:
-        info = client.info()
+        info = redis.info()
         begun = time.perf_counter()
         for _ in range(20):
-            client.ping()
+            redis.ping()
         ping = (time.perf_counter() - begun) / 20
-        yield from _clock_of_redis(client)
+        yield from _clock_of_redis(redis)
     except RedisError as error:
         yield Finding(
             level="wrong",
@@ -215,9 +215,9 @@ def redis(client: "Redis") -> Iterator[Finding]:
     )
 
 
-def _clock_of_redis(client: "Redis") -> Iterator[Finding]:
+def _clock_of_redis(redis: "Redis") -> Iterator[Finding]:
     before = time.time()
-    seconds, micros = client.time()
+    seconds, micros = redis.time()
     skew = seconds + micros / 1e6 - (before + time.time()) / 2
     yield _if(
         abs(skew) <= SKEW_SECONDS,

@@ -20,10 +20,10 @@ class Measures:
 
     def add(self, amounts: Mapping[str, float]) -> None:
         """Adds to counters, in one round trip."""
-        pipe = self._redis.pipeline(transaction=False)
+        redis = self._redis.pipeline(transaction=False)
         for field, amount in amounts.items():
-            pipe.hincrbyfloat(_KEY, field, amount)
-        pipe.execute()
+            redis.hincrbyfloat(_KEY, field, amount)
+        redis.execute()
 
     def read(self) -> dict[tuple[str, ...], float]:
         """Each counter's value, by its name and its labels' values."""

@@ -216,6 +216,10 @@ class Supervisor:
         self, task: Task, outcome: child.Finished | child.Failed | None, seconds: float
     ) -> None:
         """Tells the attempt's log and the farm's counters how it went."""
+        try:
+            self._measures.add(account(task.kind, outcome, seconds, self._limits.threads))
+        except RedisError as error:
+            log.info("not counted", reason=str(error))
         told: dict[str, Any] = {"seconds": round(seconds, 3)}
         if output := self._output.take():
             told["output"] = output
@@ -223,10 +227,6 @@ class Supervisor:
             log.warning("failed", cause=str(outcome.cause), reason=outcome.reason, **told)
         else:
             log.info("done" if outcome else "given up", **told)
-        try:
-            self._measures.add(account(task.kind, outcome, seconds, self._limits.threads))
-        except RedisError as error:
-            log.info("not counted", reason=str(error))
 
     def _tell(
         self, task: Task, outcome: child.Finished | child.Failed | None, stop: threading.Event
