@@ -83,8 +83,8 @@ def time_text(job: JobView) -> str:
 
 
 def worker_table(workers: Iterable[WorkerView], names: dict[str, str]) -> Table:
-    """A line a worker; `names` are the jobs' by their ids."""
-    table = _table("worker", "", "threads", "task", "bucket", "samples", "")
+    """A line a worker; `names` are the jobs' by their ids, where they are to be told."""
+    table = _table("worker", "", "threads", "task", "")
     for worker in workers:
         doing = worker.doing
         if not worker.alive:
@@ -93,14 +93,15 @@ def worker_table(workers: Iterable[WorkerView], names: dict[str, str]) -> Table:
             state, task = Text("● idle", "bright_black"), ""
         else:
             state = Text("● at work", "green")
-            task = f"{doing.kind} {names.get(doing.job, doing.job)}, frame {doing.frame}"
-        bucket = samples = ""
+            task = f"{doing.kind} frame {doing.frame}"
+            if doing.job in names:
+                task += f" of {names[doing.job]}"
         progress: RenderableType = ""
         if doing and doing.bucket and doing.samples:
-            bucket = "{},{} to {},{}".format(*doing.bucket)
-            samples = "{} to {}".format(*doing.samples)
-            progress = bar(doing.progress, "rendering", 12)
-        table.add_row(worker.name, state, str(worker.threads), task, bucket, samples, progress)
+            task += ", pixels {},{} to {},{}".format(*doing.bucket)
+            task += ", samples {} to {}".format(*doing.samples)
+            progress = bar(doing.progress, "rendering", 10)
+        table.add_row(worker.name, state, str(worker.threads), task, progress)
     return table
 
 
@@ -111,13 +112,13 @@ def job_picture(
     head = Table.grid(padding=(0, 2))
     head.add_row(Text(job.name, "bold"), state_text(job.state), Text(job.id, "bright_black"))
     line = Table.grid(padding=(0, 2))
-    line.add_row(bar(job.progress, job.state, 40), f"{job.progress:.0%}", describe(job))
+    line.add_row(bar(job.progress, job.state, 20), f"{job.progress:.0%}", describe(job))
     parts: list[RenderableType] = [head, line, "", _grid(frame_map)]
     if job.active:
         parts += ["", _frames(job.active)]
     here = [worker for worker in workers if worker.doing and worker.doing.job == job.id]
     if here and job.state is JobState.RUNNING:
-        parts += ["", worker_table(here, {job.id: job.name})]
+        parts += ["", worker_table(here, {})]
     for frame in failed[:MOST_REASONS]:
         text = Text(f"frame {frame.frame}: ", "red").append(frame.reason or "", "default")
         parts.append(Padding(text, (1, 0, 0, 0)))

@@ -159,7 +159,7 @@ function showWorker(box, worker) {
 }
 
 function bucketWords({ bucket: [x0, y0, x1, y1], samples: [first, last] }) {
-  return `pixels ${x0},${y0} to ${x1},${y1} · samples ${first} to ${last}`;
+  return `pixels ${x0},${y0} – ${x1},${y1} · samples ${first} – ${last}`;
 }
 
 function showFarm() {
