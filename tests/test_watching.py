@@ -1,8 +1,10 @@
 """What the farm tells of itself: attempts' logs and counters."""
 
+import io
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,10 +17,13 @@ import httpx
 import pileus_core as core
 import pytest
 import structlog
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
 
-from pileus_service import framelog, logs
+from pileus_service import framelog, logs, terminal
 from pileus_service.client import Client
-from pileus_service.jobs import Job, Wish
+from pileus_service.jobs import FrameMap, Job, JobState, JobView, Wish
 from pileus_service.shot import Shot
 from pileus_service.store import Store
 from pileus_worker.embedded import EmbeddedFarm, embedded_farm
@@ -91,6 +96,21 @@ def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame:
     assert kept < 2 * (framelog.FILE_BYTES + 2000)
     lines = framelog.read(folder, 50)
     assert [int(line.event.split()[0]) for line in lines] == list(range(950, 1000))
+
+
+@given(st.text("prmdfc.", min_size=1, max_size=300))
+def test_the_grid_has_a_mark_for_every_frame_in_its_place(states: str) -> None:
+    frame_map = FrameMap(frames=f"10-{9 + len(states)}", states=states, width=1, height=1)
+    job = JobView(
+        id="j", name="n", state=JobState.RUNNING, priority=5, frames=len(states), frames_done=0,
+        frames_failed=0, progress=0.0, samples=0, tasks=0, created=0.0,
+    )  # fmt: skip
+    page = io.StringIO()
+    Console(file=page, width=100).print(terminal.job_picture(job, frame_map, [], []))
+    rows = re.findall(r"^ *(\d+) ([·○◐◕●✗ -]+)$", page.getvalue(), re.MULTILINE)
+    assert [int(first) for first, _ in rows] == list(range(10, 10 + len(states), terminal.ROW))
+    marks = "".join(marks for _, marks in rows).replace(" ", "")
+    assert marks == states.translate(str.maketrans("prmdfc.", "○◐◕●✗-·"))
 
 
 def test_every_line_says_what_it_is_about(capsys: pytest.CaptureFixture[str]) -> None:

@@ -177,10 +177,14 @@ class Farm:
 
     def workers(self) -> list[WorkerView]:
         """The workers, each with its task in a user's words."""
-        return [
-            worker.model_copy(update={"doing": self._doing(worker)}) if worker.alive else worker
-            for worker in self.queue.workers()
-        ]
+        workers = self.queue.workers()
+        # Those at one frame one after another, so that its plan is parsed once.
+        at_work = sorted(
+            (worker for worker in workers if worker.alive and worker.task),
+            key=lambda worker: (worker.task.job, worker.task.frame) if worker.task else ("", 0),
+        )
+        doing = {worker.name: self._doing(worker) for worker in at_work}
+        return [worker.model_copy(update={"doing": doing.get(worker.name)}) for worker in workers]
 
     def _doing(self, worker: WorkerView) -> Doing | None:
         task = worker.task
