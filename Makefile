@@ -7,8 +7,21 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
 DEBIAN := redis-server cmake ninja-build g++ ccache libopenvdb-dev libboost-dev libboost-iostreams-dev \
 	libimath-dev libopenexr-dev libopenimageio-dev libtbb-dev libgtest-dev \
 	clang-format pkg-config python3-venv python3-dev
+# What the slow tests alone ask for.
+SLOW := chromium prometheus
 CORE := $(shell find core -type f -not -path '*/build/*' -not -name '*.pyc')
 JOBS := $(shell nproc)
+
+# Installs what is missing of a list of packages.
+define install
+@for package in $(1); do \
+    dpkg-query -W -f '$${Status}\n' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+done; \
+if [ -n "$$missing" ]; then \
+    $(SUDO) apt-get update -qq && \
+    $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing; \
+fi
+endef
 
 .PHONY: demo test test-slow lint setup clean
 
@@ -19,7 +32,7 @@ test: lint build/.built
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest
 
-test-slow: lint build/.built
+test-slow: lint build/.built $(VENV)/.slow
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest -m ''
 
@@ -32,14 +45,12 @@ lint: setup
 setup: $(VENV)/.system $(VENV)/.core $(VENV)/.pileus
 
 $(VENV)/.system: Makefile
-	@for package in $(DEBIAN); do \
-	    dpkg-query -W -f '$${Status}\n' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
-	done; \
-	if [ -n "$$missing" ]; then \
-	    $(SUDO) apt-get update -qq && \
-	    $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$missing; \
-	fi
+	$(call install,$(DEBIAN))
 	@mkdir -p $(VENV) && touch $@
+
+$(VENV)/.slow: Makefile $(VENV)/.system
+	$(call install,$(SLOW))
+	@touch $@
 
 $(VENV)/.venv: $(VENV)/.system
 	test -x $(PYTHON) || python3 -m venv $(VENV)
