@@ -12,7 +12,6 @@ import binascii
 import hashlib
 import hmac
 import json
-import secrets
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -109,9 +108,10 @@ class Webhooks:
             },
         }
         for url in urls:
-            notice = Notice(
-                id=f"msg_{secrets.token_hex(12)}", url=url, created=now, body=json.dumps(body)
-            )
+            # Several services may see the job end: what they tell is one notice.
+            end = f"{job.id} {wish.state} {wish.finished or now} {url}"
+            name = f"msg_{hashlib.sha256(end.encode()).hexdigest()[:24]}"
+            notice = Notice(id=name, url=url, created=now, body=json.dumps(body))
             write_whole(self._outbox / f"{notice.id}.json", notice.model_dump_json().encode())
 
     async def deliver(self) -> None:
