@@ -7,7 +7,10 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from pileus_service.queue import connect
+from pileus_service.farm import Farm
+from pileus_service.queue import Queue, connect
+from pileus_service.roots import Roots
+from pileus_service.store import Store
 from pileus_worker.private_redis import PrivateRedis
 
 
@@ -52,3 +55,12 @@ def shot(tmp_path: Path) -> dict[str, Any]:
         "transport": {"method": "multiple", "max_bounces": 4},
         "sampling": {"samples": 4, "seed": 7},
     }
+
+
+@pytest.fixture
+def farm(redis: Redis, tmp_path: Path, shot: dict[str, Any]) -> Farm:
+    """The service's farm without workers; the shot's caches are there, empty."""
+    (tmp_path / "caches").mkdir()
+    for frame in (1, 2, 3):
+        (tmp_path / "caches" / f"cloud.{frame:04d}.vdb").touch()
+    return Farm(Store(tmp_path / "data"), Queue(redis), Roots([tmp_path]))

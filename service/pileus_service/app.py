@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeVar
 import structlog
 from fastapi import APIRouter, Depends, FastAPI, Header, Query, Response
 from fastapi import Path as PathParam
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, Field
 from redis.exceptions import RedisError
 from sse_starlette import EventSourceResponse
@@ -18,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from pileus_service import __version__, framelog, metrics, pages, problems
 from pileus_service.auth import Guard
 from pileus_service.farm import ConflictError, Farm
+from pileus_service.headers import SecurityHeaders
 from pileus_service.jobs import JOB_ID, TERMINAL, FrameMap, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted, Change, Submission
 from pileus_service.problems import Problem
@@ -62,14 +63,23 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
     app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
     problems.install(app)
     app.add_middleware(problems.BodyLimit, limit=MAX_BODY)
+    app.add_middleware(SecurityHeaders)
     pages.install(app)
     app.include_router(_jobs(farm), prefix="/v1", dependencies=[Depends(guard)])
 
-    @app.get("/v1/workers", dependencies=[Depends(guard)], tags=["farm"])
+    @app.get(
+        "/v1/workers", dependencies=[Depends(guard)], tags=["farm"], responses=problems.GUARDED
+    )
     def workers() -> list[WorkerView]:
         return farm.workers()
 
-    @app.get("/metrics", dependencies=[Depends(guard)], tags=["farm"])
+    @app.get(
+        "/metrics",
+        dependencies=[Depends(guard)],
+        tags=["farm"],
+        response_class=PlainTextResponse,
+        responses=problems.GUARDED,
+    )
     def prometheus() -> Response:
         return Response(metrics.exposition(farm.queue), media_type="text/plain; version=0.0.4")
 
@@ -77,7 +87,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
     def healthy() -> Health:
         return Health()
 
-    @app.get("/readyz", tags=["farm"])
+    @app.get("/readyz", tags=["farm"], responses=problems.responses(503))
     def ready() -> Health:
         farm.queue.redis.ping()
         return Health()

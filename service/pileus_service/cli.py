@@ -14,7 +14,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pileus_service import __version__, doctor, terminal
+from pileus_service import __version__, doctor, terminal, tokens
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.jobs import JobState
@@ -73,6 +73,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+app.add_typer(tokens.app)
 
 
 @app.callback(invoke_without_command=True)

@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pileus_service.errors import InputError
+from pileus_service.headers import HEADERS
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -42,9 +43,9 @@ def _answer(
     document = ProblemDocument(
         title=HTTPStatus(status).phrase, status=status, detail=detail, errors=errors
     )
-    return JSONResponse(
-        document.model_dump(), status, headers=dict(headers or {}), media_type=MEDIA_TYPE
-    )
+    # An unforeseen error is answered outside all middleware, hence the security headers here.
+    told = {**HEADERS, **(headers or {})}
+    return JSONResponse(document.model_dump(), status, headers=told, media_type=MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
@@ -115,10 +116,17 @@ class BodyLimit:
         await self._app(scope, bounded, send)
 
 
-RESPONSES: dict[int | str, dict[str, Any]] = {
-    status: {
-        "description": HTTPStatus(status).phrase,
-        "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/ProblemDocument"}}},
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """What a route's OpenAPI entry says of the problems that it answers with."""
+    schema = {"$ref": "#/components/schemas/ProblemDocument"}
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {MEDIA_TYPE: {"schema": schema}},
+        }
+        for status in statuses
     }
-    for status in (400, 401, 403, 404, 409, 413, 422, 503)
-}
+
+
+GUARDED = responses(401, 403, 429, 503)
+RESPONSES = GUARDED | responses(400, 404, 409, 413, 422)

@@ -17,6 +17,7 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
 
+from pileus_service.errors import InputError
 from pileus_service.jobs import (
     FORMAT,
     FrameView,
@@ -46,14 +47,18 @@ FRAME_STATES: dict[str, Literal["planning", "rendering", "merging"]] = {
 
 def connect(url: str) -> "Redis":
     """A client that rides out a short absence of Redis."""
-    return Redis.from_url(
-        url,
-        decode_responses=True,
-        socket_timeout=5,
-        socket_connect_timeout=5,
-        retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=3),
-        retry_on_error=[*UNREACHABLE],
-    )
+    try:
+        return Redis.from_url(
+            url,
+            decode_responses=True,
+            socket_timeout=5,
+            socket_connect_timeout=5,
+            retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=3),
+            retry_on_error=[*UNREACHABLE],
+        )
+    except (ValueError, AttributeError) as error:
+        # Never the address itself: it may hold a password.
+        raise InputError(f"--redis: {error}; write redis://HOST:PORT/0") from None
 
 
 class Queue:

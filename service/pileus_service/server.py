@@ -2,7 +2,6 @@
 
 import contextlib
 import socket
-import sys
 from pathlib import Path
 
 import uvicorn
@@ -37,23 +36,22 @@ def bind(listen: str) -> socket.socket:
 
 
 def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> uvicorn.Server:
-    """A server ready to run; says the token, once, where it had to make one."""
+    """A server ready to run."""
     host, _ = split_address(listen)
     try:
         store = Store(data.resolve())
-        guard, token = guard_for(host, data)
+        guard = guard_for(host, data)
     except OSError as error:
         raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
-    if token:
-        print(f"The token of this farm, shown this once: {token}", file=sys.stderr)
-    try:
-        queue = Queue(connect(redis_url))
-    except ValueError as error:
-        raise InputError(f"--redis {redis_url}: {error}") from None
-    app = create_app(Farm(store, queue, Roots(roots)), guard)
+    app = create_app(Farm(store, Queue(connect(redis_url)), Roots(roots)), guard)
     # Watchers hold their connections open: they are not waited for at the end.
     config = uvicorn.Config(
-        app, log_config=None, access_log=False, log_level="warning", timeout_graceful_shutdown=1
+        app,
+        log_config=None,
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        timeout_graceful_shutdown=1,
     )
     return uvicorn.Server(config)
 

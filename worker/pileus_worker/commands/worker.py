@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from pileus_service import logs
-from pileus_service.errors import InputError
 from pileus_service.framelog import FrameLog
 from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
@@ -58,10 +57,7 @@ def worker(
         signal.signal(number, lambda *_: stop.set())
     allowed = int(memory * (1 << 30)) or machine.memory_bytes()
     limits = Limits(threads or machine.cores(), machine.cache_bytes(allowed), allowed, task_seconds)
-    try:
-        queue = Queue(connect(redis))
-    except ValueError as error:
-        raise InputError(f"--redis {redis}: {error}") from None
+    queue = Queue(connect(redis))
     roots = Roots(root or [Path.cwd()])
     paths = PathMap.parse(maps or [])
     Supervisor(queue, store, tuple(roots.folders), limits, paths).run(stop)

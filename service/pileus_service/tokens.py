@@ -1,0 +1,49 @@
+"""`pileus token`: makes, lists and revokes the tokens of a data folder."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pileus_service.auth import Role, Tokens
+
+app = typer.Typer(
+    name="token", help="Makes, lists and revokes the service's tokens.", no_args_is_help=True
+)
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Whose it is: a-z, 0-9 and -.")]
+Data = Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")]
+DATA = Path("pileus-data")
+
+
+@app.command()
+def create(
+    name: Name,
+    role: Annotated[Role, typer.Option(help="What its bearer may do.")] = Role.SUBMIT,
+    data: Data = DATA,
+) -> None:
+    """Makes a token and shows it, this once."""
+    print(Tokens(data).create(name, role))
+
+
+@app.command()
+def revoke(name: Name, data: Data = DATA) -> None:
+    """Ends a token, at once."""
+    Tokens(data).revoke(name)
+    print(f"{name}: revoked")
+
+
+@app.command("list")
+def list_tokens(
+    data: Data = DATA,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")] = False,
+) -> None:
+    """Lists the tokens' names, roles and ages; the tokens themselves are not kept."""
+    tokens = Tokens(data).all()
+    if as_json:
+        print(json.dumps([token.model_dump(mode="json", exclude={"digest"}) for token in tokens]))
+        return
+    for token in tokens:
+        made = time.strftime("%Y-%m-%d", time.gmtime(token.created))
+        print(f"{token.name:20} {token.role:8} made {made}")
