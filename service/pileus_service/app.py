@@ -14,14 +14,17 @@ from pydantic import BaseModel, Field
 from redis.exceptions import RedisError
 from sse_starlette import EventSourceResponse
 from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from pileus_service import __version__, framelog, metrics, pages, problems
 from pileus_service.auth import Guard
+from pileus_service.errors import InputError
 from pileus_service.farm import ConflictError, Farm
 from pileus_service.headers import SecurityHeaders
 from pileus_service.jobs import JOB_ID, TERMINAL, FrameMap, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted, Change, Submission
 from pileus_service.problems import Problem
+from pileus_service.roots import Roots
 
 log = structlog.stdlib.get_logger(__name__)
 
@@ -98,7 +101,9 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
 def _jobs(farm: Farm) -> APIRouter:
     router = APIRouter(prefix="/jobs", tags=["jobs"], responses=problems.RESPONSES)
 
-    @router.post("", status_code=201)
+    @router.post(
+        "", status_code=201, responses={200: {"model": Accepted, "description": "Is there already"}}
+    )
     def submit(body: Submission, response: Response, idempotency_key: Key = None) -> Accepted:
         """Takes a shot. The same Idempotency-Key with the same shot is the same job."""
         try:
@@ -128,15 +133,18 @@ def _jobs(farm: Farm) -> APIRouter:
         """The state of every frame, a letter each."""
         return _found(farm.frame_map(job_id), job_id)
 
-    @router.get("/{job_id}/frames/{frame}/preview.png", response_class=FileResponse)
+    @router.get("/{job_id}/frames/{frame}/preview.png", response_class=_Preview)
     def preview(job_id: Id, frame: FrameNumber) -> FileResponse:
         _found(farm.done(job_id, frame), f"{job_id}, frame {frame}")
-        return _file(farm.store.frame(job_id, frame).preview, "image/png")
+        path = farm.store.frame(job_id, frame).preview
+        if not path.is_file():
+            raise Problem(404, f"{path.name} is gone from the disk")
+        return _Preview(path, filename=path.name)
 
-    @router.get("/{job_id}/frames/{frame}/image.exr", response_class=FileResponse)
+    @router.get("/{job_id}/frames/{frame}/image.exr", response_class=_Image)
     def image(job_id: Id, frame: FrameNumber) -> FileResponse:
         done = _found(farm.done(job_id, frame), f"{job_id}, frame {frame}")
-        return _file(Path(done.file), "image/x-exr")
+        return _image(farm.roots, Path(done.file))
 
     @router.get("/{job_id}/frames/{frame}/log")
     def frame_log(job_id: Id, frame: FrameNumber, limit: Limit = 1000) -> list[framelog.LogLine]:
@@ -193,7 +201,29 @@ def _found(thing: T | None, name: str) -> T:
     return thing
 
 
-def _file(path: Path, media_type: str) -> FileResponse:
-    if not path.is_file():
-        raise Problem(404, f"{path.name} is gone from the disk")
-    return FileResponse(path, media_type=media_type, filename=path.name)
+class _Preview(FileResponse):
+    """A preview of the data folder."""
+
+    media_type = "image/png"
+
+
+class _Image(FileResponse):
+    """An image under the roots, held open from the check until it is sent."""
+
+    media_type = "image/x-exr"
+    held: contextlib.ExitStack
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self.held:
+            await super().__call__(scope, receive, send)
+
+
+def _image(roots: Roots, path: Path) -> _Image:
+    held = contextlib.ExitStack()
+    try:
+        location = held.enter_context(roots.reading(path))
+    except InputError as error:
+        raise Problem(404, str(error)) from None
+    answer = _Image(location, media_type=_Image.media_type, filename=path.name)
+    answer.held = held
+    return answer

@@ -43,7 +43,7 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
         guard = guard_for(host, data)
     except OSError as error:
         raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
-    app = create_app(Farm(store, Queue(connect(redis_url)), Roots(roots)), guard)
+    app = create_app(Farm(store, Queue(connect(redis_url)), Roots(roots, data)), guard)
     # Watchers hold their connections open: they are not waited for at the end.
     config = uvicorn.Config(
         app,

@@ -3,11 +3,13 @@
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
 import pileus_core as core
 
 from pileus_service.jobs import Cache
 from pileus_worker.paths import NOWHERE_ELSE, PathMap
+from pileus_worker.scene import Opener, as_named
 
 Key = tuple[str, int, int, str]
 
@@ -15,9 +17,12 @@ Key = tuple[str, int, int, str]
 class Caches:
     """Least recently used go first; a file that has changed is read anew."""
 
-    def __init__(self, limit: int, paths: PathMap = NOWHERE_ELSE) -> None:
+    def __init__(
+        self, limit: int, paths: PathMap = NOWHERE_ELSE, reading: Opener = as_named
+    ) -> None:
         self._limit = limit
         self._paths = paths
+        self._reading = reading
         self._held: OrderedDict[Key, Future[core.Volume]] = OrderedDict()
         self._lock = threading.Lock()
         self._reader = ThreadPoolExecutor(2, thread_name_prefix="reader")
@@ -51,7 +56,8 @@ class Caches:
         return self._held[key]
 
     def _read(self, key: Key) -> core.Volume:
-        volume = core.Volume(self._paths.here(key[0]), key[3])
+        with self._reading(Path(self._paths.here(key[0]))) as location:
+            volume = core.Volume(location, key[3])
         with self._lock:
             self.bytes_read += key[2]
         return volume

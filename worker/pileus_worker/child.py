@@ -91,8 +91,8 @@ def run(pipe: "Connection[Any, Any]", output: "Connection[Any, Any]", setup: Set
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
-    store, roots = Store(setup.data), Roots(setup.roots)
-    caches = Caches(setup.cache_bytes, setup.paths)
+    store, roots = Store(setup.data), Roots(setup.roots, setup.data)
+    caches = Caches(setup.cache_bytes, setup.paths, roots.reading)
     executor = ThreadPoolExecutor(1, thread_name_prefix="task")
     try:
         while True:

@@ -1,7 +1,10 @@
 """From a shot and a frame to the renderer's objects, and what an image's header says of them."""
 
+import contextlib
 import hashlib
 import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,10 +13,17 @@ import pileus_core as core
 from pileus_service import __version__
 from pileus_service.frames import expand
 from pileus_service.jobs import Cache
-from pileus_service.shot import DistantLight, Shot
+from pileus_service.shot import DistantLight, DomeLight, Shot
 from pileus_worker.paths import NOWHERE_ELSE, PathMap
 
 Header = dict[str, str | float | tuple[int, int] | list[float]]
+# Gives the location at which the renderer is to open a file.
+Opener = Callable[[Path], AbstractContextManager[str]]
+
+
+def as_named(path: Path) -> AbstractContextManager[str]:
+    """For who may read whatever a path leads to."""
+    return contextlib.nullcontext(str(path))
 
 
 def cache_path(shot: Shot, frame: int) -> Path:
@@ -36,7 +46,9 @@ def make_camera(shot: Shot, frame: int) -> core.Camera:
     return core.Camera(position=pose.position, look_at=pose.look_at, up=pose.up, fov=pose.fov)
 
 
-def make_scene(shot: Shot, frame: int, volume: core.Volume) -> core.Scene:
+def make_scene(
+    shot: Shot, frame: int, volume: core.Volume, reading: Opener = as_named
+) -> core.Scene:
     medium = shot.volumes[0]
     return core.Scene(
         volume=volume,
@@ -44,18 +56,24 @@ def make_scene(shot: Shot, frame: int, volume: core.Volume) -> core.Scene:
         albedo=medium.albedo,
         anisotropy=medium.anisotropy,
         camera=make_camera(shot, frame),
-        lights=[
-            core.DistantLight(
-                direction=light.direction, irradiance=light.irradiance, angle=light.angle
-            )
-            if isinstance(light, DistantLight)
-            else core.DomeLight(radiance=light.radiance, texture=light.texture or "")
-            for light in shot.lights
-        ],
+        lights=[_light(light, frame, reading) for light in shot.lights],
         width=shot.image.width,
         height=shot.image.height,
         background=shot.image.background,
     )
+
+
+def _light(
+    light: DistantLight | DomeLight, frame: int, reading: Opener
+) -> core.DistantLight | core.DomeLight:
+    if isinstance(light, DistantLight):
+        return core.DistantLight(
+            direction=light.direction, irradiance=light.irradiance, angle=light.angle
+        )
+    if light.texture is None:
+        return core.DomeLight(radiance=light.radiance, texture="")
+    with reading(Path(expand(light.texture, frame))) as location:
+        return core.DomeLight(radiance=light.radiance, texture=location)
 
 
 def make_transport(shot: Shot) -> core.Transport:

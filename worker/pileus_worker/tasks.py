@@ -154,13 +154,12 @@ class Work:
     def _write(self, files: FrameStore, frame: core.Frame, seconds: float) -> None:
         shot = self.job.shot
         transport = scene.make_transport(shot)
-        output = self.paths.shot(shot).output(self.frame)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        frame.write(
-            str(output),
-            half=shot.image.pixel_type == "half",
-            header=scene.header(shot, self.frame, transport, seconds),
-        )
+        with self.roots.writing(self.paths.shot(shot).output(self.frame)) as location:
+            frame.write(
+                location,
+                half=shot.image.pixel_type == "half",
+                header=scene.header(shot, self.frame, transport, seconds),
+            )
         write_preview(files.preview, frame.pixels(shot.transport.looks[0].name))
         files.mark_done(
             Done(
@@ -181,7 +180,8 @@ class Work:
             raise InputError(f"{cache.path}: has changed since its frame was planned; submit again")
         with self._phase("load"):
             volume = self.caches.get(cache, self.job.shot.volumes[0].density)
-        return scene.make_scene(self.paths.shot(self.job.shot), self.frame, volume)
+        shot = self.paths.shot(self.job.shot)
+        return scene.make_scene(shot, self.frame, volume, self.roots.reading)
 
     def _samples(self, view: core.Scene, bucket: Bucket, samples: tuple[int, int]) -> core.Partial:
         shot = self.job.shot
