@@ -3,12 +3,23 @@
 from pydantic import ValidationError
 
 
+def printable(text: str) -> str:
+    """Text as one line that no terminal obeys: what a file or caller put in is shown escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class InputError(ValueError):
     """Wrong input: the message names the file, the field and the mend (exit code 2)."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class FarmError(RuntimeError):
     """The work failed although the input was right (exit code 1)."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 def one_line(source: str, error: ValidationError) -> str:

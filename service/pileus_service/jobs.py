@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from pileus_service import __version__
 from pileus_service.shot import Shot
 
-Priority = Annotated[int, Field(ge=0, le=9)]
+Priority = Annotated[int, Field(ge=0, le=9, strict=True)]
 JOB_ID = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 JobId = Annotated[str, StringConstraints(pattern=rf"^{JOB_ID.pattern}$")]
 Bucket = tuple[int, int, int, int]

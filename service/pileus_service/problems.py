@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from redis.exceptions import RedisError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pileus_service.errors import InputError
@@ -63,8 +64,16 @@ def install(app: FastAPI) -> None:
     setattr(app, "openapi", with_problems)  # noqa: B010, the way FastAPI documents
 
     @app.exception_handler(HTTPException)
-    def http(_: Request, error: HTTPException) -> JSONResponse:
-        return _answer(error.status_code, str(error.detail), [], error.headers)
+    def http(request: Request, error: HTTPException) -> JSONResponse:
+        headers = error.headers
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            # Starlette names the methods of the first route with this path alone.
+            found = [
+                route for route in app.routes if route.matches(request.scope)[0] is not Match.NONE
+            ]
+            methods = {method for route in found for method in getattr(route, "methods", ())}
+            headers = {"Allow": ", ".join(sorted(methods))}
+        return _answer(error.status_code, str(error.detail), [], headers)
 
     @app.exception_handler(RequestValidationError)
     def invalid(_: Request, error: RequestValidationError) -> JSONResponse:

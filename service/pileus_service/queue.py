@@ -17,7 +17,7 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
 
-from pileus_service.errors import InputError
+from pileus_service.errors import InputError, printable
 from pileus_service.jobs import (
     FORMAT,
     FrameView,
@@ -282,7 +282,9 @@ class Queue:
 
     def fail(self, task: Task, worker: str, reason: str) -> Literal["released", "parked", "lost"]:
         """Ends an attempt that failed; another worker can take the task at once."""
-        outcome = self._run("release", worker, task.priority, task.entry, reason[:500] or "failed")
+        outcome = self._run(
+            "release", worker, task.priority, task.entry, printable(reason)[:500] or "failed"
+        )
         return cast(Literal["released", "parked", "lost"], outcome)
 
     def hand_back(self, task: Task, worker: str) -> None:

@@ -19,17 +19,19 @@ from pydantic import (
 
 from pileus_service.frames import expand, has_pattern, parse_frames
 
-Vec3 = tuple[float, float, float]
+# Strict: a file's "12" or true is no number, and was hardly meant as one.
+Number = Annotated[float, Field(strict=True)]
+Whole = Annotated[int, Field(strict=True)]
+Flag = Annotated[bool, Field(strict=True)]
+Vec3 = tuple[Number, Number, Number]
 Method = Literal["single", "contrast", "multiple", "density", "reference"]
-Unit = Annotated[float, Field(ge=0, le=1)]
-Colour = tuple[
-    Annotated[float, Field(ge=0, le=1e6)],
-    Annotated[float, Field(ge=0, le=1e6)],
-    Annotated[float, Field(ge=0, le=1e6)],
-]
+Unit = Annotated[Number, Field(ge=0, le=1)]
+Radiance = Annotated[Number, Field(ge=0, le=1e6)]
+Colour = tuple[Radiance, Radiance, Radiance]
 FilePath = Annotated[str, Field(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f]+$")]
 
 MAX_PIXELS = 1 << 27
+MAX_VALUES = 1 << 32
 MAX_ORDERS = 64
 
 
@@ -54,12 +56,12 @@ class Model(BaseModel):
 class Image(Model):
     """The picture's size, place and channels."""
 
-    width: int = Field(ge=1, le=65536)
-    height: int = Field(ge=1, le=65536)
+    width: Whole = Field(ge=1, le=65536)
+    height: Whole = Field(ge=1, le=65536)
     output: FilePath
     pixel_type: Literal["float", "half"] = "float"
-    orders: bool = False
-    background: bool = True
+    orders: Flag = False
+    background: Flag = True
 
     @field_validator("output")
     @classmethod
@@ -80,9 +82,9 @@ class Volume(Model):
 
     cache: FilePath
     density: str = Field(default="density", max_length=256)
-    extinction: float = Field(ge=0, le=1e9)
+    extinction: Number = Field(ge=0, le=1e9)
     albedo: tuple[Unit, Unit, Unit] = (1.0, 1.0, 1.0)
-    anisotropy: float = Field(default=0.0, gt=-1, lt=1)
+    anisotropy: Number = Field(default=0.0, gt=-1, lt=1)
 
 
 Value = TypeVar("Value", float, Vec3)
@@ -91,7 +93,7 @@ Value = TypeVar("Value", float, Vec3)
 class Key(Model, Generic[Value]):
     """A value at a frame."""
 
-    frame: float
+    frame: Number
     value: Value
 
 
@@ -106,7 +108,7 @@ AnimatedVector = Annotated[
     Discriminator(_constant_or_keyed),
 ]
 AnimatedNumber = Annotated[
-    Annotated[float, Tag("constant")] | Annotated[list[Key[float]], _Keys, Tag("keyed")],
+    Annotated[Number, Tag("constant")] | Annotated[list[Key[Number]], _Keys, Tag("keyed")],
     Discriminator(_constant_or_keyed),
 ]
 
@@ -177,7 +179,7 @@ class DistantLight(Model):
     type: Literal["distant"]
     direction: Vec3
     irradiance: Colour
-    angle: float = Field(default=0.0, ge=0, le=180)
+    angle: Number = Field(default=0.0, ge=0, le=180)
 
     @field_validator("direction")
     @classmethod
@@ -211,7 +213,7 @@ class Transport(Model):
     """The method, its depth and its looks."""
 
     method: Method = "multiple"
-    max_bounces: int | None = Field(default=None, ge=1, le=65536)
+    max_bounces: Whole | None = Field(default=None, ge=1, le=65536)
     looks: tuple[Look, ...] = Field(default=(Look(),), min_length=1, max_length=16)
 
     @model_validator(mode="after")
@@ -227,8 +229,8 @@ class Transport(Model):
 class Sampling(Model):
     """How many samples a pixel takes, and which."""
 
-    samples: int = Field(ge=1, le=1 << 20)
-    seed: int = Field(default=0, ge=0, lt=1 << 32)
+    samples: Whole = Field(ge=1, le=1 << 20)
+    seed: Whole = Field(default=0, ge=0, lt=1 << 32)
 
 
 class Shot(Model):
@@ -236,7 +238,7 @@ class Shot(Model):
 
     name: str = Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")
     frames: str = Field(max_length=10_000)
-    fps: float = Field(default=24.0, gt=0, le=100_000)
+    fps: Number = Field(default=24.0, gt=0, le=100_000)
     image: Image
     # One for now; a list, so that several can come without a new file format.
     volumes: tuple[Volume, ...] = Field(min_length=1, max_length=1)
@@ -265,11 +267,22 @@ class Shot(Model):
                 f"image.output = {self.image.output!r}: every frame would write this one file; "
                 "put #### where the frame's number goes"
             )
+        self._check_memory()
         bounces = self.transport.max_bounces
         unlimited = bounces is None and self.transport.method == "reference"
         if self.image.orders and (unlimited or (bounces or 0) > MAX_ORDERS):
             raise ValueError(f"image.orders: {self._NEEDS_DEPTH}")
         return self
+
+    def _check_memory(self) -> None:
+        """Refuses an image that no machine could hold: all layers of it are merged in memory."""
+        orders = (self.transport.max_bounces or MAX_ORDERS) if self.image.orders else 0
+        layers = len(self.transport.looks) * (8 + 3 * orders)
+        if self.image.width * self.image.height * layers > MAX_VALUES:
+            raise ValueError(
+                f"image: {layers} layers of {self.image.width} x {self.image.height} are over "
+                f"{MAX_VALUES} values; take fewer pixels, looks or orders"
+            )
 
     @property
     def frame_numbers(self) -> tuple[int, ...]:

@@ -84,9 +84,11 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: {(error.strerror or 'unreadable').lower()}; mend the path"
         ) from None
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # the parsers' own, and endless digits and nests
         kind = "JSON" if path.suffix == ".json" else "TOML"
-        raise InputError(f"{path}: is not {kind}: {error}") from None
+        raise InputError(f"{path}: is not {kind}: {error}"[:500]) from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: a shot is a table of name, frames, image, ...")
     return data
@@ -99,7 +101,7 @@ def _override(data: dict[str, Any], setting: str) -> None:
         raise InputError(f"--set {setting}: write section.key=value")
     try:
         value = tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text  # a bare word: a method, a path, a frame range
     here: Any = data
     for index, step in enumerate(steps):
