@@ -32,6 +32,22 @@ class Medium {
         }
     }
 
+    /// The medium that scatters alike with another anisotropy, by the similarity relation
+    /// sigma_s (1 - g) = const with sigma_a kept, of the channel that absorbs least; the others'
+    /// albedos are those that keep their sigma_a.
+    Medium reduced(float anisotropy) const {
+        const float albedo = max_component(albedo_);
+        const float ratio = 1.0f - albedo + albedo * (1.0f - phase_.g()) / (1.0f - anisotropy);
+        Medium result = *this;
+        result.extinction_ *= ratio;
+        result.thickest_ *= ratio;
+        for (int c = 0; c < 3; ++c) {
+            result.albedo_[c] = std::max(0.0f, 1.0f - (1.0f - albedo_[c]) / ratio);
+        }
+        result.phase_ = HenyeyGreenstein(anisotropy);
+        return result;
+    }
+
     const Volume& volume() const { return *volume_; }
     const Color& albedo() const { return albedo_; }
     const HenyeyGreenstein& phase() const { return phase_; }

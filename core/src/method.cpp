@@ -22,6 +22,7 @@ constexpr Registration registry[] = {
     {"multiple", 16, false, make_multiple},
     {"density", 16, false, make_density},
     {"reference", std::nullopt, false, make_reference},
+    {"similarity", std::nullopt, false, make_similarity},
 };
 
 const Registration& find(const std::string& name) {
@@ -53,6 +54,9 @@ Transport resolve(Transport transport) {
         throw InputError("transport.max_bounces of \"" + transport.method + "\" is always " +
                          std::to_string(*registration.bounces) + "; leave it out");
     }
+    if (transport.reduce_from < 1 || transport.reduce_from > longest_schedule)
+        throw InputError("transport.reduce_from must lie between 1 and " +
+                         std::to_string(longest_schedule));
     if (transport.looks.empty())
         throw InputError("transport.looks is empty; leave it out for a = b = c = 1");
     for (const Look& look : transport.looks) {

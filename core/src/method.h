@@ -30,6 +30,9 @@ Transport resolve(Transport transport);
 /// `transport` must be resolved.
 std::unique_ptr<Method> make_method(const Scene& scene, const Transport& transport);
 
+/// The most events that may come before the medium is reduced.
+constexpr int longest_schedule = 1024;
+
 /// Events after which any path ends, and is counted: a bound on work, far beyond what light needs.
 constexpr int most_events = 1 << 20;
 

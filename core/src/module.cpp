@@ -257,14 +257,16 @@ NB_MODULE(_core, m) {
         .def(
             "__init__",
             [](Transport* self, const std::string& method, std::optional<int> max_bounces,
-               const std::vector<Look>& looks) {
-                new (self) Transport(resolve({method, max_bounces, looks}));
+               const std::vector<Look>& looks, int reduce_from) {
+                new (self) Transport(resolve({method, max_bounces, looks, reduce_from}));
             },
-            nb::kw_only(), "method"_a, "max_bounces"_a = nb::none(), "looks"_a,
-            "Without `max_bounces`, the method's own number; None stays None for `reference`: "
-            "unlimited. Raises InputError.")
+            nb::kw_only(), "method"_a, "max_bounces"_a = nb::none(), "looks"_a, "reduce_from"_a = 3,
+            "Without `max_bounces`, the method's own number; None stays None for `reference` and "
+            "`similarity`: unlimited. `reduce_from` is the first event that `similarity` reaches "
+            "through a reduced medium. Raises InputError.")
         .def_ro("method", &Transport::method)
-        .def_ro("max_bounces", &Transport::max_bounces);
+        .def_ro("max_bounces", &Transport::max_bounces)
+        .def_ro("reduce_from", &Transport::reduce_from);
 
     nb::class_<Control>(m, "Control", "What another thread sees of a render, and how it ends it.")
         .def(nb::init<>())

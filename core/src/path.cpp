@@ -59,8 +59,10 @@ float chance(float brightness) { return std::min(1.0f, brightness); }
 
 }  // namespace
 
-DirectLight::DirectLight(const Scene& scene, const std::vector<Look>& looks, Flights flights)
+DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
+                         const std::vector<Look>& looks, Flights flights)
     : scene_(scene),
+      schedule_(schedule),
       looks_(looks),
       tracked_(flights == Flights::tracked),
       all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
@@ -74,11 +76,12 @@ void DirectLight::set_terms(int first, int last) {
     for (std::size_t k = 0; k < looks_.size(); ++k) {
         for (int i = first; i < last; ++i) {
             const Look& look = looks_[k];
-            const auto power = [i](float base) {
-                return base == 1.0f ? 1.0f : std::pow(base, static_cast<float>(i));
+            const int order = schedule_.order(i);
+            const auto power = [order](float base) {
+                return base == 1.0f ? 1.0f : std::pow(base, static_cast<float>(order));
             };
-            terms_.push_back({k, i, power(look.b),
-                              HenyeyGreenstein(power(look.c) * scene_.medium.phase().g()),
+            terms_.push_back({k, order, power(look.b),
+                              HenyeyGreenstein(power(look.c) * schedule_.at(i).phase().g()),
                               power(look.a), tracked_ && look.physical()});
         }
     }
@@ -87,7 +90,8 @@ void DirectLight::set_terms(int first, int last) {
 void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
                       PathRecord& record) {
     set_terms(first, last);
-    const HenyeyGreenstein& phase = scene_.medium.phase();
+    const HenyeyGreenstein& phase = schedule_.at(first).phase();
+    const Medium& onward = schedule_.onward(first);
     const Lobe lobe(phase, last > 1);
     Random event_stream = random.stream(light_stream, static_cast<std::uint64_t>(first));
     const float roulette = first == 0 ? 0.0f : event_stream.uniform();
@@ -104,10 +108,10 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
             const float lobe_density =
                 hit ? lobe.density(event.direction, sample->direction) : 0.0f;
             float others = 0.0f;  // the inverse densities that the bridges weigh in
-            if (tracked_ && !hit) {
+            if (!hit && bridged(first)) {
                 for (const float inverse : event.inverse_density) others += inverse;
             }
-            Shadow shadow(scene_.medium, event.position, sample->direction, stream);
+            Shadow shadow(onward, event.position, sample->direction, stream);
             for (const Term& term : terms_) {
                 const float rival = hit ? (term.walk ? seen : lobe_density) : 0.0f;
                 const float share = rival > 0.0f ? sample->density / (sample->density + rival)
@@ -132,7 +136,7 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        Shadow shadow(scene_.medium, event.position, direction, lobe_stream);
+        Shadow shadow(onward, event.position, direction, lobe_stream);
         for (const Term& term : terms_) {
             if (term.walk) continue;
             const float scattered = term.phase.density(event.direction, direction) / density;
@@ -145,11 +149,11 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
     }
 }
 
-void DirectLight::add_bridges(const ScatterEvent& event, int order, int end,
-                              const PathRandom& random, PathRecord& record) {
-    const Medium& medium = scene_.medium;
-    const HenyeyGreenstein& phase = medium.phase();
-    Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(order));
+void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
+                              PathRecord& record) {
+    const HenyeyGreenstein& phase = schedule_.at(n).phase();
+    if (!bridged(n + 1)) return;
+    Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(n));
     for (const auto& light : scene_.lights) {
         if (light->can_be_hit()) continue;
         Random stream(event_stream.bits());
@@ -162,8 +166,8 @@ void DirectLight::add_bridges(const ScatterEvent& event, int order, int end,
         std::array<V3f, longest_bridge> chain;
         V3f next = sample->direction;
         float chain_inverse = 0.0f, last_density = 0.0f;
-        const int most = std::min(longest_bridge, end - 1 - order);
-        for (int length = 1; length <= most; ++length) {
+        for (int length = 1; length <= longest_bridge && n + length < end && bridged(n + length);
+             ++length) {
             const float v1 = stream.uniform(), v2 = stream.uniform();
             const V3f direction = phase.sample(next, v1, v2);
             const float density = phase.density(direction, next);
@@ -177,9 +181,10 @@ void DirectLight::add_bridges(const ScatterEvent& event, int order, int end,
             Random own(stream.bits());
             if (own.uniform() >= odds) continue;
             if (const auto arrival =
-                    fly(event, {chain.data(), static_cast<std::size_t>(length)}, own)) {
-                set_terms(order + length, order + length + 1);
-                Shadow shadow(medium, arrival->position, sample->direction, own);
+                    fly(event, n, {chain.data(), static_cast<std::size_t>(length)}, own)) {
+                set_terms(n + length, n + length + 1);
+                Shadow shadow(schedule_.onward(n + length), arrival->position, sample->direction,
+                              own);
                 for (const Term& term : terms_) {
                     const float scattered =
                         term.phase.density(chain[0], sample->direction) / (last_density * inverse);
@@ -193,13 +198,13 @@ void DirectLight::add_bridges(const ScatterEvent& event, int order, int end,
     }
 }
 
-/// Where a path comes to that flies on from an event along the directions of a chain, its last
+/// Where a path comes to that flies on from event n along the directions of a chain, its last
 /// first; nothing if it leaves the medium on its way.
-std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, std::span<const V3f> chain,
-                                             Random& random) const {
-    const Medium& medium = scene_.medium;
+std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, int n,
+                                             std::span<const V3f> chain, Random& random) const {
     ScatterEvent event = from;
     for (auto direction = chain.rbegin(); direction != chain.rend(); ++direction) {
+        const Medium& medium = schedule_.onward(n++);
         const LocalRay flight = medium.ray(event.position, *direction);
         const auto distance = delta_track(medium, flight, random.exponential(), random);
         if (!distance) return std::nullopt;
@@ -209,9 +214,17 @@ std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, std::span
     return event;
 }
 
-void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float density,
-                             int order, PathRecord& record) const {
+/// Whether light of event n's order also comes by bridges: where its lobe, and so those of the
+/// events before it, is the medium's own and narrow.
+bool DirectLight::bridged(int n) const {
+    constexpr float narrow = 0.5f;
+    return tracked_ && schedule_.plain(n) && schedule_.at(n).phase().g() > narrow;
+}
+
+void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float density, int n,
+                             PathRecord& record) const {
     if (!tracked_) return;
+    const int order = schedule_.order(n);
     for (const auto& light : scene_.lights) {
         if (!light->can_be_hit()) continue;
         const float share = density / (density + light->density(direction));

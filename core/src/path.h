@@ -4,6 +4,7 @@
 
 #include "random.h"
 #include "scene.h"
+#include "schedule.h"
 
 #include <array>
 #include <cstdint>
@@ -97,8 +98,8 @@ enum class Flights {
     other
 };
 
-/// Adds the direct light at an event, Eq. 1 for the orders [first, last), to every look: for each
-/// light
+/// Adds the direct light at an event, Eq. 1 for the orders of the events [first, last), to every
+/// look: for each light
 ///   sigma_s b^i L p(w_i, w_o, c^i g) exp(-a^i integral of sigma_t to the light).
 /// Looks share the directions, and the shadow rays where they share the power a^i.
 ///
@@ -113,20 +114,20 @@ enum class Flights {
 ///   1 / (sum of 1 / p): it has a peak only where all of them do.
 class DirectLight {
   public:
-    DirectLight(const Scene& scene, const std::vector<Look>& looks, Flights flights);
+    DirectLight(const Scene& scene, const Schedule& schedule, const std::vector<Look>& looks,
+                Flights flights);
 
     void add(const ScatterEvent& event, int first, int last, const PathRandom& random,
              PathRecord& record);
 
-    /// Adds light of the orders after `order`, below `end`, by way of further events between this
-    /// one and each distant light.
-    void add_bridges(const ScatterEvent& event, int order, int end, const PathRandom& random,
+    /// Adds the light that reaches event n by way of further events, up to event `end`, between it
+    /// and each distant light.
+    void add_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
                      PathRecord& record);
 
     /// Adds what a walk that has left the medium sees of the sky, for the physical looks: it
-    /// scattered into `direction` at `event`, of the given order, with that phase density, and met
-    /// nothing more.
-    void add_escape(const ScatterEvent& event, const V3f& direction, float density, int order,
+    /// scattered into `direction` at event n with that phase density, and met nothing more.
+    void add_escape(const ScatterEvent& event, const V3f& direction, float density, int n,
                     PathRecord& record) const;
 
   private:
@@ -140,10 +141,12 @@ class DirectLight {
     };
 
     void set_terms(int first, int last);
-    std::optional<ScatterEvent> fly(const ScatterEvent& from, std::span<const V3f> chain,
+    bool bridged(int n) const;
+    std::optional<ScatterEvent> fly(const ScatterEvent& from, int n, std::span<const V3f> chain,
                                     Random& random) const;
 
     const Scene& scene_;
+    const Schedule& schedule_;
     const std::vector<Look>& looks_;
     bool tracked_;
     bool all_walk_;

@@ -36,6 +36,7 @@ struct Transport {
     std::string method;
     std::optional<int> max_bounces;  // scatter events on a path; nothing: unlimited
     std::vector<Look> looks;
+    int reduce_from = 3;  // `similarity`: the first event that a reduced medium leads to
 };
 
 /// A ray through a point of the image: where it enters the volume's box, if it does.

@@ -115,14 +115,16 @@ Scene cube(float extinction, const Color& albedo, float g,
                             {extinction, albedo, g, resolution, resolution});
 }
 
-TEST(WhiteFurnace, ReferenceIsOneAtEveryPixel) {
+TEST(WhiteFurnace, TrackedMethodsAreOneAtEveryPixel) {
     // Every path ends in the dome with its whole weight: not only the mean is 1.
-    for (const float g : {-0.9f, 0.0f, 0.85f}) {
-        const Scene scene = cube(10.0f, Color(1.0f), g, {test::constant_dome()});
-        const Partial partial = test::render_whole(scene, test::transport_of("reference"), 16);
-        EXPECT_EQ(partial.bounded_paths, 0);
-        for (std::size_t i = 0; i < 256; ++i) {
-            ASSERT_FLOAT_EQ(partial.image.plane(0, Partial::r)[i], 1.0f) << i;
+    for (const char* method : {"reference", "similarity"}) {
+        for (const float g : {-0.9f, 0.0f, 0.85f}) {
+            const Scene scene = cube(10.0f, Color(1.0f), g, {test::constant_dome()});
+            const Partial partial = test::render_whole(scene, test::transport_of(method), 16);
+            EXPECT_EQ(partial.bounded_paths, 0);
+            for (std::size_t i = 0; i < 256; ++i) {
+                ASSERT_FLOAT_EQ(partial.image.plane(0, Partial::r)[i], 1.0f) << method << i;
+            }
         }
     }
 }

@@ -24,7 +24,7 @@ Number = Annotated[float, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Flag = Annotated[bool, Field(strict=True)]
 Vec3 = tuple[Number, Number, Number]
-Method = Literal["single", "contrast", "multiple", "density", "reference"]
+Method = Literal["single", "contrast", "multiple", "density", "reference", "similarity"]
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Radiance = Annotated[Number, Field(ge=0, le=1e6)]
 Colour = tuple[Radiance, Radiance, Radiance]
@@ -33,6 +33,7 @@ FilePath = Annotated[str, Field(min_length=1, max_length=1024, pattern=r"^[^\x00
 MAX_PIXELS = 1 << 27
 MAX_VALUES = 1 << 32
 MAX_ORDERS = 64
+UNLIMITED = ("reference", "similarity")  # without max_bounces
 
 
 class Model(BaseModel):
@@ -214,6 +215,7 @@ class Transport(Model):
 
     method: Method = "multiple"
     max_bounces: Whole | None = Field(default=None, ge=1, le=65536)
+    reduce_from: Whole = Field(default=3, ge=1, le=1024)
     looks: tuple[Look, ...] = Field(default=(Look(),), min_length=1, max_length=16)
 
     @model_validator(mode="after")
@@ -269,7 +271,7 @@ class Shot(Model):
             )
         self._check_memory()
         bounces = self.transport.max_bounces
-        unlimited = bounces is None and self.transport.method == "reference"
+        unlimited = bounces is None and self.transport.method in UNLIMITED
         if self.image.orders and (unlimited or (bounces or 0) > MAX_ORDERS):
             raise ValueError(f"image.orders: {self._NEEDS_DEPTH}")
         return self

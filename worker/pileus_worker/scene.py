@@ -79,7 +79,12 @@ def _light(
 def make_transport(shot: Shot) -> core.Transport:
     asked = shot.transport
     looks = [core.Look(name=look.name, a=look.a, b=look.b, c=look.c) for look in asked.looks]
-    return core.Transport(method=asked.method, max_bounces=asked.max_bounces, looks=looks)
+    return core.Transport(
+        method=asked.method,
+        max_bounces=asked.max_bounces,
+        looks=looks,
+        reduce_from=asked.reduce_from,
+    )
 
 
 def reason(shot: Shot) -> str:

@@ -13,7 +13,8 @@ class Contrast final : public Method {
     Contrast(const Scene& scene, const Transport& transport)
         : scene_(scene),
           octaves_(*transport.max_bounces),
-          light_(scene, transport.looks, Flights::other) {}
+          schedule_(scene.medium),
+          light_(scene, schedule_, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         Random walk = random.stream(walk_stream);
@@ -25,6 +26,7 @@ class Contrast final : public Method {
   private:
     const Scene& scene_;
     int octaves_;
+    Schedule schedule_;
     DirectLight light_;
     DensityMarch march_;
 };

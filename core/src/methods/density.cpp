@@ -12,7 +12,8 @@ class Density final : public Method {
     Density(const Scene& scene, const Transport& transport)
         : scene_(scene),
           orders_(*transport.max_bounces),
-          light_(scene, transport.looks, Flights::other) {}
+          schedule_(scene.medium),
+          light_(scene, schedule_, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
@@ -35,6 +36,7 @@ class Density final : public Method {
   private:
     const Scene& scene_;
     int orders_;
+    Schedule schedule_;
     DirectLight light_;
     DensityMarch march_;
 };

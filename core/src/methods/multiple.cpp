@@ -22,7 +22,8 @@ class Multiple final : public Method {
     Multiple(const Scene& scene, const Transport& transport)
         : scene_(scene),
           orders_(*transport.max_bounces),
-          light_(scene, transport.looks, Flights::other) {}
+          schedule_(scene.medium),
+          light_(scene, schedule_, transport.looks, Flights::other) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
@@ -57,6 +58,7 @@ class Multiple final : public Method {
   private:
     const Scene& scene_;
     int orders_;
+    Schedule schedule_;
     DirectLight light_;
     DensityMarch march_;
 };

@@ -1,0 +1,90 @@
+// `reference` and `similarity`: volumetric path tracing by delta tracking under exact local
+// majorants, with ratio tracking for shadows and Russian roulette on weights that absorption has
+// made small. In the medium itself (`reference`) it is unbiased, the truth for the other methods;
+// in media reduced after the first events (`similarity`) it needs far fewer events, for a small
+// bias.
+#include "../tracking.h"
+#include "methods.h"
+
+#include <cmath>
+
+namespace pileus {
+
+namespace {
+
+class Tracked final : public Method {
+  public:
+    Tracked(const Scene& scene, const Transport& transport, Schedule schedule)
+        : scene_(scene),
+          schedule_(std::move(schedule)),
+          bounded_(!transport.max_bounces),
+          events_(schedule_.events(transport.max_bounces.value_or(most_events))),
+          light_(scene, schedule_, transport.looks, Flights::tracked) {}
+
+    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+        Random walk = random.stream(walk_stream);
+        LocalRay flight = *ray.volume;
+        auto distance = delta_track(scene_.medium, flight, -std::log1p(-random.first[2]), walk);
+        if (!distance) return;
+        record.opacity = 1.0f;
+        record.depth = (ray.entry_distance + *distance) * ray.depth_per_distance;
+
+        ScatterEvent event{flight.at(*distance), ray.direction, scene_.medium.albedo()};
+        for (int n = 0;; ++n) {
+            light_.add(event, n, n + 1, random, record);
+            light_.add_bridges(event, n, events_, random, record);
+            const float u1 = n == 0 ? random.second()[2] : walk.uniform();
+            const float u2 = n == 0 ? random.second()[3] : walk.uniform();
+            const HenyeyGreenstein& phase = schedule_.at(n).phase();
+            const V3f direction = phase.sample(event.direction, u1, u2);
+            const float density = phase.density(event.direction, direction);
+            const Medium& medium = schedule_.onward(n);
+            flight = medium.ray(event.position, direction);
+            distance = delta_track(medium, flight, walk.exponential(), walk);
+            if (!distance) {
+                light_.add_escape(event, direction, density, n, record);
+                return;
+            }
+            if (n + 1 == events_) {
+                record.bounded = bounded_;
+                return;
+            }
+            event = {flight.at(*distance),
+                     direction,
+                     event.weight * medium.albedo(),
+                     {1.0f / density, event.inverse_density[0]}};
+            if (!survives(event.weight, walk)) return;
+        }
+    }
+
+  private:
+    /// Russian roulette on weights that absorption has made small; a path without absorption is
+    /// never ended.
+    static bool survives(Color& weight, Random& random) {
+        constexpr float small = 0.25f;
+        const float most = max_component(weight);
+        if (most >= small) return true;
+        if (random.uniform() * small >= most) return false;
+        weight *= small / most;
+        return true;
+    }
+
+    const Scene& scene_;
+    Schedule schedule_;
+    bool bounded_;  // whether only the bound on work ends a path
+    int events_;
+    DirectLight light_;
+};
+
+}  // namespace
+
+std::unique_ptr<Method> make_reference(const Scene& scene, const Transport& transport) {
+    return std::make_unique<Tracked>(scene, transport, Schedule(scene.medium));
+}
+
+std::unique_ptr<Method> make_similarity(const Scene& scene, const Transport& transport) {
+    return std::make_unique<Tracked>(scene, transport,
+                                     Schedule(scene.medium, transport.reduce_from));
+}
+
+}  // namespace pileus
