@@ -26,7 +26,7 @@ from pileus_service.client import Client
 from pileus_service.jobs import FrameMap, Job, JobState, JobView, Wish
 from pileus_service.shot import Shot
 from pileus_service.store import Store
-from pileus_worker.embedded import EmbeddedFarm, embedded_farm
+from pileus_worker.embedded import LOG_BYTES, EmbeddedFarm, Workers, embedded_farm
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
 
@@ -96,6 +96,19 @@ def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame:
     assert kept < 2 * (framelog.FILE_BYTES + 2000)
     lines = framelog.read(folder, 50)
     assert [int(line.event.split()[0]) for line in lines] == list(range(950, 1000))
+
+
+def test_the_workers_log_is_bounded(tmp_path: Path) -> None:
+    with (tmp_path / "workers.log").open("ab") as log:
+        writer = Workers(["sh", "-c", "while echo line; do sleep 0.01; done"], 1, log)
+        try:
+            log.truncate(LOG_BYTES + 1)
+            writer.keep_up()
+            time.sleep(0.3)
+        finally:
+            writer.end()
+    assert (tmp_path / "workers.old.log").stat().st_size > LOG_BYTES
+    assert 0 < (tmp_path / "workers.log").stat().st_size < 10_000
 
 
 @given(st.text("prmdfc.", min_size=1, max_size=300))
