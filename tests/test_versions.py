@@ -3,19 +3,17 @@ mixes the bits of two versions."""
 
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pileus_core as core
 import pytest
 from redis import Redis
 
 import pileus_service
 import pileus_worker
-from hosts import PILEUS, process, service, until
+from hosts import PILEUS, process, same_images, service, until
 from pileus_service.jobs import (
     FORMAT,
     Kind,
@@ -174,11 +172,4 @@ def test_an_upgrade_mixes_no_versions_in_a_frame(
         old.send_signal(signal.SIGKILL)
         until(lambda: client.job(job).state in ("done", "failed"), 120)
         assert client.job(job).state == "done", client.job(job).reason
-    file = tmp_path / "shot.json"
-    file.write_text(asked.model_dump_json())
-    subprocess.run([PILEUS, "render", file, "--out", tmp_path / "here"], check=True)
-    for frame in asked.frame_numbers:
-        [farm] = core.read_image(str(asked.output(frame))).values()
-        [here] = core.read_image(str(tmp_path / "here" / asked.output(frame).name)).values()
-        for name, values in here.items():
-            np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+    same_images(asked, tmp_path)
