@@ -57,7 +57,7 @@ def service(data: Path, redis: str, *roots: Path) -> Iterator[Client]:
             assert serving.poll() is None, log.read_text()
             return _connects(port)
 
-        until(answers, 30)
+        until(answers, 120)
         yield client
 
 

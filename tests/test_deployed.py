@@ -149,7 +149,7 @@ def asked(shot: dict[str, Any]) -> Shot:
 
 def finish(client: Client, shot: Shot) -> None:
     job = client.submit(shot).job.id
-    until(lambda: client.job(job).state in ("done", "failed"), 120)
+    until(lambda: client.job(job).state in ("done", "failed"), 300)
     assert client.job(job).state == "done", client.job(job).reason
 
 
@@ -198,11 +198,11 @@ def test_a_farm_of_containers_renders_a_shot(
             service.start(tmp_path / "service.log", "--listen", listen, "--root", "/shows"),
             Client(f"http://{listen}") as client,
         ):
-            until(lambda: connects(port), 60)
+            until(lambda: connects(port), 180)
             assert service.healthy(port)
             assert not worker.healthy()
             with worker.start(tmp_path / "worker.log", *worker.config["Cmd"], "--threads", "1"):
-                until(client.workers, 60)
+                until(client.workers, 180)
                 assert worker.healthy()
                 finish(client, asked)
     assert (shows / "out" / "test.0001.exr").stat().st_uid == USER
@@ -274,8 +274,8 @@ def test_a_farm_of_units_renders_a_shot_in_its_sandbox(
     place = root / "srv/pileus/shows"
     shutil.copy(shows / "cloud.vdb", place)
     with Client(f"http://127.0.0.1:{port}") as client:
-        until(lambda: connects(port), 120)
-        until(client.workers, 60)
+        until(lambda: connects(port), 300)
+        until(client.workers, 180)
         worker = client.workers()[0]
         finish(client, PathMap.parse(["/shows=/srv/pileus/shows"]).shot(asked))
         for pid in of_user(USER):
@@ -285,7 +285,7 @@ def test_a_farm_of_units_renders_a_shot_in_its_sandbox(
             assert (held["NoNewPrivs"], held["Seccomp"]) == ("1", "2")
         inside = ["nsenter", "-t", str(init_of(root)), "-m", "-p", "-u"]
         run(*inside, "systemctl", "kill", "--signal=KILL", "pileus-worker")
-        until(lambda: {each.name for each in client.workers() if each.alive} - {worker.name}, 60)
+        until(lambda: {each.name for each in client.workers() if each.alive} - {worker.name}, 180)
     same_images(PathMap.parse([f"/shows={place}"]).shot(asked), tmp_path)
 
 

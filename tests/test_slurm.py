@@ -125,7 +125,7 @@ def long_shot(tmp_path: Path, shot: dict[str, Any]) -> Shot:
     core.make_cloud(str(tmp_path / "cloud.vdb"), frame=1, frames=1, resolution=48)
     shot["image"] |= {"width": 96, "height": 64}
     shot["volumes"][0]["cache"] = str(tmp_path / "cloud.vdb")
-    shot["sampling"]["samples"] = 1500
+    shot["sampling"]["samples"] = 600
     return Shot.model_validate(shot)
 
 
@@ -153,7 +153,7 @@ def rendering(client: Client) -> list[WorkerView]:
 def test_workers_take_what_slurm_gives_and_a_cancelled_one_hands_its_task_back(
     slurm: Slurm, client: Client, array: str, redis: Redis, long_shot: Shot, tmp_path: Path
 ) -> None:
-    until(lambda: len(client.workers()) == 2, 90)
+    until(lambda: len(client.workers()) == 2, 180)
     assert {worker.threads for worker in client.workers()} == {1}
     given = Path(f"/proc/{client.workers()[0].pid}/cmdline").read_text().split("\0")
     assert float(given[given.index("--memory") + 1]) == pytest.approx(0.9 * 900 / 1024, rel=1e-3)
@@ -162,11 +162,11 @@ def test_workers_take_what_slurm_gives_and_a_cancelled_one_hands_its_task_back(
     assert folder.is_dir()
 
     job = client.submit(long_shot).job.id
-    until(lambda: len(rendering(client)) == 2, 60)
+    until(lambda: len(rendering(client)) == 2, 180)
     slurm("scancel", f"{array}_1")
     until(lambda: len(client.workers()) == 1, 25)
     until(lambda: slurm.states(array) == ["RUNNING"], 30)
-    until(lambda: client.job(job).state in ("done", "failed"), 240)
+    until(lambda: client.job(job).state in ("done", "failed"), 900)
     assert client.job(job).state == "done", client.job(job).reason
     # Handed back, not waited for and not counted as failed.
     stats = Queue(redis).stats()
@@ -179,19 +179,19 @@ def test_workers_take_what_slurm_gives_and_a_cancelled_one_hands_its_task_back(
 def test_preempted_workers_hand_back_and_come_again(
     slurm: Slurm, client: Client, array: str, redis: Redis, long_shot: Shot, tmp_path: Path
 ) -> None:
-    until(lambda: len(client.workers()) == 2, 90)
+    until(lambda: len(client.workers()) == 2, 180)
     before = {worker.name for worker in client.workers()}
     job = client.submit(long_shot).job.id
-    until(lambda: len(rendering(client)) == 2, 60)
+    until(lambda: len(rendering(client)) == 2, 180)
     slurm("sbatch", "--partition=high", "--exclusive", "--wait", "--wrap", "true")
     # The grace is 30 s: they did not wait for its end to be killed.
     assert slurm.states(array) == ["PENDING", "PENDING"]
     assert not client.workers()
     assert client.job(job).state == "running"
-    until(lambda: _due(slurm, array), 150)
-    until(lambda: len(client.workers()) == 2, 90)
+    until(lambda: _due(slurm, array), 300)
+    until(lambda: len(client.workers()) == 2, 180)
     assert not before & {worker.name for worker in client.workers()}
-    until(lambda: client.job(job).state in ("done", "failed"), 240)
+    until(lambda: client.job(job).state in ("done", "failed"), 900)
     assert client.job(job).state == "done", client.job(job).reason
     stats = Queue(redis).stats()
     assert stats.get("attempts_failed", 0) == stats.get("leases_lost", 0) == 0

@@ -154,7 +154,7 @@ def test_an_upgrade_mixes_no_versions_in_a_frame(
         process(tmp_path / "old.log", *command, env={"PYTHONPATH": str(former)}) as old,
         process(tmp_path / "new.log", *command),
     ):
-        until(lambda: len({each.version for each in client.workers()}) == 2, 60)
+        until(lambda: len({each.version for each in client.workers()}) == 2, 180)
         job = client.submit(asked).job.id
 
         def both_at_work() -> bool:
@@ -163,13 +163,13 @@ def test_an_upgrade_mixes_no_versions_in_a_frame(
                     seen.setdefault(each.task.frame, set()).add(each.version)
             return len(set[str]().union(*seen.values())) == 2
 
-        until(both_at_work, 60)
+        until(both_at_work, 180)
         for _ in range(10):
             both_at_work()
             time.sleep(0.05)
         assert all(len(versions) == 1 for versions in seen.values())
         # The frame that the old one is amid is planned anew by the new one.
         old.send_signal(signal.SIGKILL)
-        until(lambda: client.job(job).state in ("done", "failed"), 120)
+        until(lambda: client.job(job).state in ("done", "failed"), 300)
         assert client.job(job).state == "done", client.job(job).reason
     same_images(asked, tmp_path)
