@@ -50,6 +50,7 @@ class Work:
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
         files = self.store.frame(self.job.id, self.frame)
+        files.look_again()
         if self.kind is Kind.PLAN:
             return self._plan(files)
         plan = files.plan()
