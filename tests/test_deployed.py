@@ -181,7 +181,7 @@ def test_a_farm_of_containers_renders_a_shot(
     redis_port, port = free_port(), free_port()
     # Redis's image is another's; its command is ours, and is run here, in a folder of its own.
     script = compose["redis"]["command"][2].replace("$$", "$")
-    script = script.replace("/etc/pileus", str(DEPLOY)).replace("/tmp", str(tmp_path))
+    script = script.replace("/tmp", str(tmp_path)).replace("/etc/pileus", str(DEPLOY))
     script = script.replace("--dir /data", f"--dir {tmp_path} --port {redis_port}")
     environment = dict.fromkeys(compose["redis"]["environment"], PASSWORD)
     url = compose["service"]["environment"]["PILEUS_REDIS"]
