@@ -18,10 +18,11 @@ from starlette.types import Receive, Scope, Send
 
 from pileus_service import __version__, framelog, metrics, pages, problems
 from pileus_service.auth import Guard
+from pileus_service.broadcast import Broadcast
 from pileus_service.errors import InputError
 from pileus_service.farm import ConflictError, Farm
 from pileus_service.headers import SecurityHeaders
-from pileus_service.jobs import JOB_ID, TERMINAL, FrameMap, FrameView, JobView, WorkerView
+from pileus_service.jobs import JOB_ID, FrameMap, FrameView, JobView, WorkerView
 from pileus_service.messages import Accepted, Change, Submission
 from pileus_service.problems import Problem
 from pileus_service.roots import Roots
@@ -32,6 +33,7 @@ MAX_BODY = 1 << 20
 T = TypeVar("T")
 
 Id = Annotated[str, PathParam(pattern=f"^{JOB_ID.pattern}$")]
+WorkerName = Annotated[str, PathParam(min_length=1, max_length=200)]
 FrameNumber = Annotated[int, PathParam(ge=0, le=999_999_999)]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Offset = Annotated[int, Query(ge=0, le=1_000_000)]
@@ -54,27 +56,53 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
                 log.warning("cannot reconcile yet", reason=str(error))
             await asyncio.sleep(1)
 
+    broadcast = Broadcast(farm)
+
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        keepers = [asyncio.create_task(keep_true()), asyncio.create_task(farm.hooks.deliver())]
+        running = (keep_true(), broadcast.run(), farm.hooks.deliver())
+        tasks = [asyncio.create_task(each) for each in running]
         yield
-        for keeper in keepers:
-            keeper.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await keeper
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
     problems.install(app)
     app.add_middleware(problems.BodyLimit, limit=MAX_BODY)
     app.add_middleware(SecurityHeaders)
     pages.install(app)
-    app.include_router(_jobs(farm), prefix="/v1", dependencies=[Depends(guard)])
+    app.include_router(_jobs(farm, broadcast), prefix="/v1", dependencies=[Depends(guard)])
 
     @app.get(
         "/v1/workers", dependencies=[Depends(guard)], tags=["farm"], responses=problems.GUARDED
     )
     def workers() -> list[WorkerView]:
         return farm.workers()
+
+    @app.post(
+        "/v1/workers/{name}/drain",
+        status_code=204,
+        dependencies=[Depends(guard)],
+        tags=["farm"],
+        responses=problems.RESPONSES,
+    )
+    def drain(name: WorkerName) -> None:
+        """Gives the worker no more tasks; what it has in hand it finishes."""
+        _found(name in farm.queue.worker_names() or None, f"worker {name}")
+        farm.queue.drain(name)
+
+    @app.post(
+        "/v1/workers/{name}/undrain",
+        status_code=204,
+        dependencies=[Depends(guard)],
+        tags=["farm"],
+        responses=problems.RESPONSES,
+    )
+    def undrain(name: WorkerName) -> None:
+        """Gives tasks again to a worker that was drained or set aside."""
+        _found(name in farm.queue.worker_names() or None, f"worker {name}")
+        farm.queue.undrain(name)
 
     @app.get(
         "/metrics",
@@ -98,7 +126,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
     return app
 
 
-def _jobs(farm: Farm) -> APIRouter:
+def _jobs(farm: Farm, broadcast: Broadcast) -> APIRouter:
     router = APIRouter(prefix="/jobs", tags=["jobs"], responses=problems.RESPONSES)
 
     @router.post(
@@ -107,7 +135,9 @@ def _jobs(farm: Farm) -> APIRouter:
     def submit(body: Submission, response: Response, idempotency_key: Key = None) -> Accepted:
         """Takes a shot. The same Idempotency-Key with the same shot is the same job."""
         try:
-            job, new = farm.submit(body.shot, body.priority, idempotency_key, body.webhook)
+            job, new = farm.submit(
+                body.shot, body.priority, idempotency_key, body.webhook, body.wait_for_caches
+            )
         except ConflictError as error:
             raise Problem(409, str(error)) from None
         if not new:
@@ -165,6 +195,11 @@ def _jobs(farm: Farm) -> APIRouter:
     def resume(job_id: Id) -> JobView:
         return _found(farm.control(job_id, "resume"), job_id)
 
+    @router.post("/{job_id}/retry")
+    def retry(job_id: Id) -> JobView:
+        """Renders the failed frames again, and no others."""
+        return _found(farm.control(job_id, "retry"), job_id)
+
     @router.patch("/{job_id}")
     def change(job_id: Id, body: Change) -> JobView:
         return _found(farm.control(job_id, "priority", body.priority), job_id)
@@ -177,20 +212,13 @@ def _jobs(farm: Farm) -> APIRouter:
     @router.get("/{job_id}/events", response_class=EventSourceResponse)
     async def events(job_id: Id) -> EventSourceResponse:
         """The job each time it changes, until it ends."""
-        _found(await run_in_threadpool(farm.job, job_id), job_id)
+        view = _found(await run_in_threadpool(farm.job, job_id), job_id)
 
-        async def changes() -> AsyncIterator[dict[str, str]]:
-            told = ""
-            while view := await run_in_threadpool(farm.job, job_id):
-                steady = view.model_copy(update={"seconds_left": None}).model_dump_json()
-                if steady != told:
-                    told = steady
-                    yield {"event": "job", "data": view.model_dump_json()}
-                if view.state in TERMINAL:
-                    return
-                await asyncio.sleep(0.5)
+        async def told() -> AsyncIterator[dict[str, str]]:
+            async for change in broadcast.changes(view):
+                yield {"event": "job", "data": change.model_dump_json()}
 
-        return EventSourceResponse(changes())
+        return EventSourceResponse(told())
 
     return router
 

@@ -121,8 +121,8 @@ Credentials = Annotated[HTTPAuthorizationCredentials | None, Security(_Bearer)]
 class Guard:
     """A dependency of every route that tells or changes anything.
 
-    GET needs the role read, DELETE admin, all else submit. Without tokens (None, or for a direct
-    caller of a `local` service) the loopback alone is let in.
+    GET needs the role read, DELETE and what steers workers admin, all else submit. Without tokens
+    (None, or for a direct caller of a `local` service) the loopback alone is let in.
     """
 
     def __init__(self, tokens: Tokens | None = None, *, local: bool = False) -> None:
@@ -142,6 +142,8 @@ class Guard:
             return
         role = self._role(self._tokens, request, credentials)
         needed = _NEEDED.get(request.method, Role.SUBMIT)
+        if needed is Role.SUBMIT and request.url.path.startswith("/v1/workers/"):
+            needed = Role.ADMIN
         if not role.may(needed):
             raise Problem(403, f"This token's role is {role}; this call needs {needed}")
 

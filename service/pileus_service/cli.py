@@ -102,12 +102,17 @@ def submit(
         str | None, typer.Option(metavar="URL", help="Told when the job has ended.")
     ] = None,
     wait: Annotated[bool, typer.Option("--wait", help="Waits until it ends.")] = False,
+    wait_for_caches: Annotated[
+        bool, typer.Option("--wait-for-caches", help="Caches may still be in the making.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Sends a shot to the farm."""
     settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
     with Client(server, token) as client:
-        accepted = client.submit(load_shot(shot, settings), priority, key, webhook)
+        accepted = client.submit(
+            load_shot(shot, settings), priority, key, webhook, wait_for_caches=wait_for_caches
+        )
         for warning in accepted.warnings:
             print(f"{shot}: warning: {warning}", file=sys.stderr)
         job = accepted.job
@@ -175,7 +180,7 @@ def frame_log(
             print(f"    {text}")
 
 
-def _verb(verb: Literal["cancel", "pause", "resume"], text: str) -> None:
+def _verb(verb: Literal["cancel", "pause", "resume", "retry"], text: str) -> None:
     @app.command(verb, help=text)
     def act(
         job: JobArgument, server: Server = LOCAL, token: Token = None, as_json: AsJson = False
@@ -191,6 +196,7 @@ def _verb(verb: Literal["cancel", "pause", "resume"], text: str) -> None:
 _verb("cancel", "Stops a job for good.")
 _verb("pause", "Holds a job's tasks back; those that run finish.")
 _verb("resume", "Lets a paused job go on.")
+_verb("retry", "Renders the failed frames of a job again, and no others.")
 
 
 @app.command()
@@ -237,6 +243,18 @@ def look_at_health(
         Console().print(terminal.finding_table(findings))
     if wrong := sum(finding.level == "wrong" for finding in findings):
         raise FarmError(f"{wrong} of {len(findings)} are wrong")
+
+
+@app.command()
+def drain(
+    worker: Annotated[str, typer.Argument(metavar="WORKER", help="Its name, as listed.")],
+    server: Server = LOCAL,
+    token: Token = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Gives it tasks again.")] = False,
+) -> None:
+    """Gives a worker no more tasks; what it has in hand it finishes."""
+    with Client(server, token) as client:
+        client.drain(worker, undo=undo)
 
 
 @app.command()

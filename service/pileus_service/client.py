@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Self, TypeVar
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, TypeAdapter
@@ -12,7 +13,7 @@ from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_rand
 from pileus_service.errors import FarmError, InputError
 from pileus_service.framelog import LogLine
 from pileus_service.jobs import TERMINAL, FrameMap, FrameView, JobView, WorkerView
-from pileus_service.messages import Accepted
+from pileus_service.messages import Accepted, Submission
 from pileus_service.shot import Shot
 
 M = TypeVar("M", bound=BaseModel)
@@ -38,11 +39,19 @@ class Client:
         self._http.close()
 
     def submit(
-        self, shot: Shot, priority: int = 5, key: str | None = None, webhook: str | None = None
+        self,
+        shot: Shot,
+        priority: int = 5,
+        key: str | None = None,
+        webhook: str | None = None,
+        *,
+        wait_for_caches: bool = False,
     ) -> Accepted:
-        body = {"shot": shot.model_dump(mode="json"), "priority": priority, "webhook": webhook}
+        body = Submission(
+            shot=shot, priority=priority, webhook=webhook, wait_for_caches=wait_for_caches
+        )
         headers = {"Idempotency-Key": key} if key else {}
-        answer = self._ask("POST", "/jobs", json=body, headers=headers)
+        answer = self._ask("POST", "/jobs", json=body.model_dump(mode="json"), headers=headers)
         return Accepted.model_validate_json(answer.content)
 
     def jobs(self, limit: int = 100) -> list[JobView]:
@@ -80,6 +89,9 @@ class Client:
 
     def control(self, job: str, verb: str) -> JobView:
         return JobView.model_validate_json(self._ask("POST", f"/jobs/{job}/{verb}").content)
+
+    def drain(self, worker: str, *, undo: bool = False) -> None:
+        self._ask("POST", f"/workers/{quote(worker, safe='')}/{'undrain' if undo else 'drain'}")
 
     def workers(self) -> list[WorkerView]:
         return TypeAdapter(list[WorkerView]).validate_json(self._ask("GET", "/workers").content)

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from typing import Literal
 
 import structlog
 
@@ -31,6 +32,7 @@ from pileus_service.webhooks import Webhooks, hooks_from_environment
 
 log = structlog.stdlib.get_logger(__name__)
 
+CHECK_ALL = 30.0
 _WISHED: dict[str, Verb] = {"paused": "pause", "running": "resume", "cancelled": "cancel"}
 
 
@@ -50,15 +52,21 @@ class Farm:
         self.hooks = hooks or hooks_from_environment(store.root)
         self._lock = threading.RLock()
         self._wishes: dict[str, Wish] = {}
+        self._agreed: tuple[int, float] | None = None
 
     def submit(
-        self, shot: Shot, priority: Priority, key: str | None, webhook: str | None = None
+        self,
+        shot: Shot,
+        priority: Priority,
+        key: str | None,
+        webhook: str | None = None,
+        wait_for_caches: bool = False,
     ) -> tuple[JobView, bool]:
         """Takes a shot in; with a key, once. Returns the job and whether it is new."""
         shot = shot.anchored(self.roots.first)
         numbers = shot.frame_numbers
         self.roots.check(shot, numbers)
-        check_files(shot, shot.name, numbers)
+        check_files(shot, shot.name, numbers, caches=not wait_for_caches)
         if webhook is not None:
             self.hooks.check(webhook)
         job = Job(
@@ -66,6 +74,7 @@ class Farm:
             created=time.time(),
             shot=shot,
             webhook=webhook,
+            wait_for_caches=wait_for_caches,
         )
         wish = Wish(priority=priority)
         new = self.store.create(job, wish)
@@ -80,12 +89,16 @@ class Farm:
         return view, new
 
     def control(self, job_id: str, verb: Verb, priority: int = 0) -> JobView | None:
-        """Pauses, resumes, cancels a job or changes its priority."""
+        """Pauses, resumes, cancels a job, changes its priority or retries its failed frames."""
         with self._lock:
             view = self.job(job_id)
-            if view is None or view.state in TERMINAL:
-                return view
+            if view is None:
+                return None
             wish = self.store.wished(job_id)
+            if verb == "retry":
+                return self._retry(view, wish)
+            if view.state in TERMINAL:
+                return view
             if verb == "priority":
                 wish = wish.model_copy(update={"priority": priority})
             else:
@@ -95,6 +108,17 @@ class Farm:
             self.queue.control(job_id, verb, priority)
             log.info(verb, job=job_id, **({"priority": priority} if verb == "priority" else {}))
             return self.job(job_id)
+
+    def _retry(self, view: JobView, wish: Wish) -> JobView | None:
+        """Lets the failed frames, and no others, be tried again."""
+        if view.frames_failed == 0 or view.state is JobState.CANCELLED:
+            return view
+        life = wish.life + 1
+        state = "paused" if view.state is JobState.PAUSED else "running"
+        self._keep(view.id, Wish(state=state, priority=view.priority, life=life))
+        self.queue.control(view.id, "retry", life)
+        log.info("retry", job=view.id, frames=view.frames_failed)
+        return self.job(view.id)
 
     def remove(self, job_id: str) -> bool:
         with self._lock:
@@ -119,21 +143,27 @@ class Farm:
 
     def jobs(self, limit: int, offset: int) -> list[JobView]:
         """Newest first."""
-        workers = self.queue.workers()
-        ids = self.queue.job_ids()[::-1][offset : offset + limit]
-        views = [self.queue.job(job_id, workers) for job_id in ids]
-        return [self._numbered(view) for view in views if view]
+        views = self.views(self.queue.job_ids()[::-1][offset : offset + limit])
+        return [view for view in views if view]
+
+    def views(self, job_ids: list[str]) -> list[JobView | None]:
+        """Several jobs at the cost of about one; None for those that are not here."""
+        views = zip(job_ids, self.queue.views(job_ids), strict=True)
+        return [self._numbered(view) if view else self.job(job_id) for job_id, view in views]
 
     def frames(self, job_id: str, limit: int, offset: int) -> list[FrameView] | None:
         job, view = self.store.job(job_id), self.job(job_id)
         if job is None or view is None:
             return None
-        failed = self.queue.failed(job_id)
-        active = self.queue.active(job_id, self.queue.workers())
+        failed, waiting = self.queue.failed(job_id), self.queue.waiting(job_id)
+        active = {frame.frame: frame for frame in view.active}
+        idle: Literal["cancelled", "waiting"] = (
+            "cancelled" if view.state is JobState.CANCELLED else "waiting"
+        )
         frames = []
         for index, number in list(enumerate(job.shot.frame_numbers))[offset : offset + limit]:
-            if index in active:
-                frames.append(active[index].model_copy(update={"frame": number}))
+            if number in active:
+                frames.append(active[number])
             elif index in failed:
                 frames.append(FrameView(frame=number, state="failed", reason=failed[index]))
             elif done := self.store.frame(job_id, number).done():
@@ -148,10 +178,7 @@ class Farm:
                     )
                 )
             else:
-                cancelled = view.state is JobState.CANCELLED
-                frames.append(
-                    FrameView(frame=number, state="cancelled" if cancelled else "waiting")
-                )
+                frames.append(FrameView(frame=number, state=idle, reason=waiting.get(index)))
         return frames
 
     def frame_map(self, job_id: str) -> FrameMap | None:
@@ -205,28 +232,55 @@ class Farm:
         return self.store.frame(job_id, frame).done() if self.store.job(job_id) else None
 
     def reconcile(self) -> None:
-        """Makes Redis agree with the disk, and notes on disk how jobs ended. Called each second."""
-        known = set(self.queue.job_ids())
-        for job_id in self.store.job_ids():
-            with self._lock:
-                wish = self._wishes.get(job_id) or self.store.wished(job_id)
-                self._wishes[job_id] = wish
-                if wish.state in TERMINAL and job_id in known:
-                    continue
-                state, priority = self.queue.standing(job_id)
-                if state is None:
-                    self._restore(job_id)
-                elif state in TERMINAL:
-                    if wish.state != state:
-                        self._note_end(job_id, state)
-                elif (state, priority) != (wish.state, wish.priority):
-                    # Another service may have written since; what is on disk now holds.
-                    self._wishes[job_id] = wish = self.store.wished(job_id)
-                    if wish.state in _WISHED and wish.state != state:
-                        self.queue.control(job_id, _WISHED[wish.state])
-                    if wish.priority != priority:
-                        self.queue.control(job_id, "priority", wish.priority)
+        """Makes Redis agree with the disk, and notes on disk how jobs ended. Called each second;
+        looks at all jobs only when one has changed, Redis has lost something, or time has passed.
+        """
+        changes, now = self.queue.changes(), time.monotonic()
+        if self._agreed is not None:
+            last, at = self._agreed
+            if changes == last and now - at < CHECK_ALL:
+                return
+        # Redis first: what is on no disk by now was removed, and not just submitted.
+        standings = self.queue.standings()
+        on_disk = set(self.store.job_ids(known=self._wishes))
+        for job_id in standings.keys() - on_disk:
+            self.queue.control(job_id, "remove")
+        # Of many that Redis has lost, those with work to do come back first.
+        for job_id in sorted(on_disk, key=lambda each: (self._wish(each).state in TERMINAL, each)):
+            self._agree(job_id, standings.get(job_id))
         self.queue.forget_dead()
+        self._agreed = changes, now
+
+    def _wish(self, job_id: str) -> Wish:
+        wish = self._wishes.get(job_id)
+        if wish is None:
+            wish = self._wishes[job_id] = self.store.wished(job_id)
+        return wish
+
+    def _agree(self, job_id: str, standing: tuple[str, int, int] | None) -> None:
+        wish = self._wish(job_id)
+        if standing == (wish.state, wish.priority, wish.life):
+            return
+        with self._lock:
+            # Another may have written since; what is on disk now holds.
+            self._wishes[job_id] = wish = self.store.wished(job_id)
+            standing = self.queue.standing(job_id)
+            if standing is None:
+                self._restore(job_id)
+                return
+            state, priority, life = standing
+            if life != wish.life or (wish.state in TERMINAL and state != wish.state):
+                # A Redis of an earlier day: this job is built anew, what it has finished stays.
+                self.queue.control(job_id, "remove")
+                self._restore(job_id)
+            elif state in TERMINAL:
+                if wish.state != state:
+                    self._note_end(job_id, state)
+            else:
+                if wish.state != state:
+                    self.queue.control(job_id, _WISHED[wish.state])
+                if wish.priority != priority:
+                    self.queue.control(job_id, "priority", wish.priority)
 
     def _restore(self, job_id: str) -> bool:
         """Puts a job of the disk into Redis; what it has finished stays finished."""
@@ -246,6 +300,7 @@ class Farm:
                 {
                     "state": state,
                     "priority": view.priority,
+                    "life": self._wishes[job_id].life,
                     "finished": view.finished,
                     "failed": self.queue.failed(job_id),
                 }
@@ -263,11 +318,13 @@ class Farm:
 
     def _numbered(self, view: JobView) -> JobView:
         """Puts frame numbers in the place of indices."""
-        job = self.store.job(view.id) if view.active else None
-        numbers = job.shot.frame_numbers if job else []
-        active = [
-            frame.model_copy(update={"frame": numbers[frame.frame]})
-            for frame in view.active
-            if numbers
-        ]
-        return view.model_copy(update={"active": active})
+        job = self.store.job(view.id) if view.active or view.reason else None
+        if job is None:
+            return view.model_copy(update={"active": []})
+        numbers = job.shot.frame_numbers
+        active = [frame.model_copy(update={"frame": numbers[frame.frame]}) for frame in view.active]
+        reason = view.reason
+        if reason is not None:
+            index, _, why = reason.partition(": ")
+            reason = f"frame {numbers[int(index)]}: {why}"
+        return view.model_copy(update={"active": active, "reason": reason})

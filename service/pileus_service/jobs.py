@@ -55,19 +55,25 @@ class Cause(StrEnum):
 
 
 class Job(Record):
-    """A job as it was submitted: job.json."""
+    """A job as it was submitted: job.json. One that waits for its caches plans a frame only when
+    its cache is there and no longer grows."""
 
     id: JobId
     created: float
     shot: Shot
     webhook: str | None = None
+    wait_for_caches: bool = False
 
 
 class Wish(Record):
-    """What is wanted of a job and how it ended: state.json, written by the service alone."""
+    """What is wanted of a job and how it ended: state.json, written by the service alone.
+
+    A retry begins a new life; where Redis knows an older one, it is not to be believed.
+    """
 
     state: Literal["running", "paused", "cancelled", "failed", "done"] = "running"
     priority: Priority = 5
+    life: int = 0
     finished: float | None = None
     failed: dict[int, str] = {}
 
@@ -167,7 +173,19 @@ class Replan(Record):
     replan: Literal[True] = True
 
 
-Result = Planned | Rendered | Merged | Replan
+class Waiting(Record):
+    """In the place of a plan: the cache is not ready, and is looked for again after a while."""
+
+    wait: str
+
+
+class Stale(Record):
+    """In the place of a result: what the plan says of the cache holds no longer; plan anew."""
+
+    stale: str
+
+
+Result = Planned | Rendered | Merged | Replan | Waiting | Stale
 
 
 class WorkerInfo(Record):
@@ -195,11 +213,12 @@ class Doing(Record):
 
 
 class WorkerView(WorkerInfo):
-    """A worker as the service shows it."""
+    """A worker as the service shows it; `aside` says why it gets no tasks, where it gets none."""
 
     seen: float
     alive: bool
     doing: Doing | None = None
+    aside: str | None = None
 
 
 class FrameView(Record):

@@ -24,12 +24,14 @@ _EXAMPLE: JsonDict = {
 
 class Submission(BaseModel):
     """A shot and how urgent it is: 0 to 9, the higher the sooner. The job's end is told to
-    `webhook`, if the farm's keeper has allowed its origin."""
+    `webhook`, if the farm's keeper has allowed its origin. With `wait_for_caches` its caches may
+    still be in the making: each frame waits for its own."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [_EXAMPLE]})
     shot: Shot
     priority: Priority = 5
     webhook: Annotated[str, Field(min_length=1, max_length=2000)] | None = None
+    wait_for_caches: bool = False
 
 
 class Accepted(BaseModel):

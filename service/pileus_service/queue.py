@@ -7,7 +7,7 @@ flight: `pileus_service.store` is the truth.
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib.resources import files
 from typing import Any, Literal, cast
 
@@ -34,10 +34,11 @@ LEASE = 10.0
 RENEWAL = 2.5
 PRIORITIES = range(10)
 GROUP = "workers"
+SHARED = ("common", "issue", "attempts")
 SCRIPTS = ("submit", "claim", "renew", "complete", "release", "control")
 UNREACHABLE = (RedisConnectionError, RedisTimeoutError)
 
-Verb = Literal["pause", "resume", "cancel", "remove", "priority"]
+Verb = Literal["pause", "resume", "cancel", "remove", "priority", "retry"]
 FRAME_STATES: dict[str, Literal["planning", "rendering", "merging"]] = {
     "plan": "planning",
     "render": "rendering",
@@ -51,9 +52,9 @@ def connect(url: str) -> "Redis":
         return Redis.from_url(
             url,
             decode_responses=True,
-            socket_timeout=5,
-            socket_connect_timeout=5,
-            retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=3),
+            socket_timeout=2,
+            socket_connect_timeout=2,
+            retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=2),
             retry_on_error=[*UNREACHABLE],
         )
     except (ValueError, AttributeError) as error:
@@ -68,9 +69,10 @@ class Queue:
         self.redis = redis
         self.lease = lease
         folder = files("pileus_service") / "lua"
-        common = f"local FORMAT = {task_format}\n" + (folder / "common.lua").read_text()
+        shared = "".join((folder / f"{name}.lua").read_text() for name in SHARED)
+        shared = f"local FORMAT = {task_format}\n{shared}"
         self._scripts = {
-            name: redis.register_script(common + (folder / f"{name}.lua").read_text())
+            name: redis.register_script(shared + (folder / f"{name}.lua").read_text())
             for name in SCRIPTS
         }
 
@@ -87,6 +89,7 @@ class Queue:
             "name": name,
             "state": wish.state,
             "priority": wish.priority,
+            "life": wish.life,
             "frames": frames,
             "created": int(created * 1000),
             "finished": wish.finished and int(wish.finished * 1000),
@@ -95,59 +98,63 @@ class Queue:
         }
         return bool(self._run("submit", job, json.dumps(given)))
 
-    def control(self, job: str, verb: Verb, priority: int = 0) -> str | None:
-        """Does what a user asks to a job; returns its state afterwards, None if unknown."""
-        return cast(str | None, self._run("control", job, verb, priority))
+    def control(self, job: str, verb: Verb, number: int = 0) -> str | None:
+        """Does what a user asks to a job; returns its state afterwards, None if unknown.
+
+        `number` is the new priority, or the life that a retry begins.
+        """
+        return cast(str | None, self._run("control", job, verb, number))
 
     def job_ids(self) -> list[str]:
         return cast(list[str], self.redis.zrange("pileus:jobs", 0, -1))
 
-    def job(self, job: str, workers: list[WorkerView] | None = None) -> JobView | None:
+    def job(self, job: str) -> JobView | None:
         """A job with its progress, in-flight samples of the workers included."""
-        held = cast(dict[str, str], self.redis.hgetall(f"pileus:job:{job}"))
-        if not held:
-            return None
-        failed = self.failed(job)
-        frames, done = int(held["frames"]), int(held["done"])
-        active = self.active(job, self.workers() if workers is None else workers)
-        settled = done + len(failed) + sum(frame.progress for frame in active.values())
-        state = JobState(held["state"])
-        if state is JobState.RUNNING and "started" not in held:
-            state = JobState.QUEUED
-        left = None
-        gained = settled - int(held["restored"])
-        if state is JobState.RUNNING and gained > 0:
-            spent = self.now() - int(held["started"]) / 1000
-            left = spent * (frames - settled) / gained
-        reason = f"frame {min(failed)}: {failed[min(failed)]}" if failed else None
-        return JobView(
-            id=job,
-            name=held["name"],
-            state=state,
-            priority=int(held["priority"]),
-            frames=frames,
-            frames_done=done,
-            frames_failed=len(failed),
-            progress=settled / frames,
-            samples=int(held["samples"]),
-            tasks=int(held["tasks"]),
-            created=int(held["created"]) / 1000,
-            started=int(held["started"]) / 1000 if "started" in held else None,
-            finished=int(held["finished"]) / 1000 if "finished" in held else None,
-            seconds_left=left,
-            reason=reason,
-            active=list(active.values()),
-        )
+        return self.views([job])[0]
+
+    def views(self, jobs: Sequence[str]) -> list[JobView | None]:
+        """Jobs, in two round trips whatever their number and that of the workers."""
+        ask = self.redis.pipeline(transaction=False)
+        ask.time()
+        for job in jobs:
+            key = f"pileus:job:{job}"
+            ask.hgetall(key)
+            ask.hgetall(f"{key}:failed")
+            ask.hgetall(f"{key}:flight")
+            ask.zrange(f"{key}:active", 0, -1)
+        (seconds, micros), *told = ask.execute()
+        rows = [told[at : at + 4] for at in range(0, len(told), 4)]
+        for job, (_, _, _, active) in zip(jobs, rows, strict=True):
+            for frame in active:
+                ask.hgetall(f"pileus:job:{job}:frame:{frame}")
+        frames = iter(ask.execute())
+        views: list[JobView | None] = []
+        for job, (held, failed, flight, active) in zip(jobs, rows, strict=True):
+            in_flight: Counter[int] = Counter()
+            for entry in flight.values():
+                frame, samples = entry.split()
+                in_flight[int(frame)] += int(samples)
+            shown = [_frame_view(int(index), next(frames), in_flight) for index in active]
+            in_order = [frame for frame in shown if frame]
+            now = seconds + micros / 1e6
+            views.append(_job_view(job, held, failed, in_order, now) if held else None)
+        return views
+
+    def standings(self) -> dict[str, tuple[str, int, int]]:
+        """Each job's state, priority and life."""
+        held = cast(dict[str, str], self.redis.hgetall("pileus:standing"))
+        return {job: _standing(told) for job, told in held.items()}
+
+    def standing(self, job: str) -> tuple[str, int, int] | None:
+        told = cast(str | None, self.redis.hget("pileus:standing", job))
+        return _standing(told) if told else None
 
     def state(self, job: str) -> str | None:
         return cast(str | None, self.redis.hget(f"pileus:job:{job}", "state"))
 
-    def standing(self, job: str) -> tuple[str | None, int]:
-        """A job's state (None if unknown) and priority."""
-        state, priority = cast(
-            list[str | None], self.redis.hmget(f"pileus:job:{job}", "state", "priority")
-        )
-        return state, int(priority or 0)
+    def changes(self) -> int:
+        """A count that differs after any job's standing has changed, or Redis has lost its data."""
+        return int(cast(str | None, self.redis.get("pileus:changes")) or -1)
 
     def failed(self, job: str) -> dict[int, str]:
         """Reason by frame index."""
@@ -166,44 +173,48 @@ class Queue:
             if byte & 0x80 >> bit
         }
 
-    def active(self, job: str, workers: list[WorkerView]) -> dict[int, FrameView]:
-        """The frames in flight, by index (which stands in their `frame` too)."""
-        in_flight: dict[int, int] = {}
-        for worker in workers:
-            if worker.alive and worker.task and worker.task.job == job:
-                frame = worker.task.frame
-                in_flight[frame] = in_flight.get(frame, 0) + worker.samples
-        views: dict[int, FrameView] = {}
-        for index in cast(list[str], self.redis.zrange(f"pileus:job:{job}:active", 0, -1)):
-            held = cast(dict[str, str], self.redis.hgetall(f"pileus:job:{job}:frame:{index}"))
-            if not held:
-                continue
-            total = int(held["total"])
-            samples = int(held["samples"]) + in_flight.get(int(index), 0)
-            views[int(index)] = FrameView(
-                frame=int(index),
-                state=FRAME_STATES[held["state"]],
-                tasks=int(held["tasks"]),
-                tasks_done=int(held["done"]),
-                progress=min(1.0, samples / total) if total else 0.0,
-            )
-        return views
+    def waiting(self, job: str) -> dict[int, str]:
+        """The frames that wait for their caches: reason by frame index."""
+        held = cast(dict[str, str], self.redis.hgetall(f"pileus:job:{job}:waiting"))
+        return {int(frame): reason for frame, reason in held.items()}
 
     def workers(self) -> list[WorkerView]:
         """Those seen within a day, the live ones first."""
-        seen = cast(
-            list[tuple[str, float]], self.redis.zrange("pileus:alive", 0, -1, withscores=True)
-        )
-        now = self.now()
-        views = []
-        for name, score in seen:
-            info = cast(str | None, self.redis.get(f"pileus:worker:{name}"))
-            if info is None:
-                continue
-            alive = now - score / 1000 <= self.lease
-            told = WorkerInfo.model_validate_json(info)
-            views.append(WorkerView(**dict(told), seen=score / 1000, alive=alive))
+        ask = self.redis.pipeline(transaction=False)
+        ask.time()
+        ask.zrange("pileus:alive", 0, -1, withscores=True)
+        ask.zrange("pileus:aside", 0, -1, withscores=True)
+        ask.hgetall("pileus:aside:why")
+        (seconds, micros), seen, aside, why = ask.execute()
+        if not seen:
+            return []
+        now = seconds + micros / 1e6
+        kept_off = {name for name, until in aside if until / 1000 > now}
+        infos = self.redis.mget([f"pileus:worker:{name}" for name, _ in seen])
+        views = [
+            WorkerView(
+                **dict(WorkerInfo.model_validate_json(info)),
+                seen=score / 1000,
+                alive=now - score / 1000 <= self.lease,
+                aside=why.get(name, "") if name in kept_off else None,
+            )
+            for (name, score), info in zip(seen, cast(list[str | None], infos), strict=True)
+            if info is not None
+        ]
         return sorted(views, key=lambda view: (not view.alive, view.name))
+
+    def worker_names(self) -> list[str]:
+        return cast(list[str], self.redis.zrange("pileus:alive", 0, -1))
+
+    def drain(self, worker: str) -> None:
+        """Gives a worker no more tasks; what it has in hand it finishes."""
+        self.redis.zadd("pileus:aside", {worker: "+inf"})
+        self.redis.hset("pileus:aside:why", worker, "drained")
+
+    def undrain(self, worker: str) -> None:
+        """Gives a worker tasks again that was drained or set aside."""
+        self.redis.zrem("pileus:aside", worker)
+        self.redis.hdel("pileus:aside:why", worker)
 
     def now(self) -> float:
         seconds, micros = self.redis.time()
@@ -270,10 +281,11 @@ class Queue:
             part=int(part),
         )
 
-    def renew(self, task: Task, info: WorkerInfo) -> bool:
-        """Renews a lease; False if another has it now and the work is to be dropped."""
+    def renew(self, task: Task, info: WorkerInfo) -> Literal["held", "unwanted", "lost"]:
+        """Renews a lease, unless nobody wants the work any more or another has it now."""
         told = info.model_dump_json()
-        return bool(self._run("renew", info.name, task.priority, task.entry, told))
+        answer = self._run("renew", info.name, task.priority, task.entry, told, info.samples)
+        return cast(Literal["held", "unwanted", "lost"], answer)
 
     def complete(self, task: Task, worker: str, result: Result) -> bool:
         """Counts a task done, once; False if the lease was lost."""
@@ -296,6 +308,8 @@ class Queue:
         self.redis.zrem("pileus:alive", worker)
         self.redis.delete(f"pileus:worker:{worker}")
         self.redis.hdel("pileus:versions", worker)
+        self.redis.hdel("pileus:strikes", worker)
+        self.undrain(worker)
         for priority in PRIORITIES:
             stream = f"pileus:tasks:{priority}"
             if self.redis.exists(stream):
@@ -304,3 +318,56 @@ class Queue:
                 )
                 if not pending:
                     self.redis.xgroup_delconsumer(stream, GROUP, worker)
+
+
+def _standing(told: str) -> tuple[str, int, int]:
+    state, priority, life = told.split()
+    return state, int(priority), int(life)
+
+
+def _frame_view(index: int, held: dict[str, str], in_flight: Counter[int]) -> FrameView | None:
+    if not held:
+        return None
+    total = int(held["total"])
+    samples = int(held["samples"]) + in_flight[index]
+    return FrameView(
+        frame=index,
+        state=FRAME_STATES[held["state"]],
+        tasks=int(held["tasks"]),
+        tasks_done=int(held["done"]),
+        progress=min(1.0, samples / total) if total else 0.0,
+    )
+
+
+def _job_view(
+    job: str, held: dict[str, str], failed: dict[str, str], active: list[FrameView], now: float
+) -> JobView:
+    frames, done = int(held["frames"]), int(held["done"])
+    settled = done + len(failed) + sum(frame.progress for frame in active)
+    state = JobState(held["state"])
+    if state is JobState.RUNNING and "started" not in held:
+        state = JobState.QUEUED
+    left = None
+    gained = settled - int(held["restored"])
+    if state is JobState.RUNNING and gained > 0:
+        left = (now - int(held["started"]) / 1000) * (frames - settled) / gained
+    first = min(failed, key=int) if failed else None
+    return JobView(
+        id=job,
+        name=held["name"],
+        state=state,
+        priority=int(held["priority"]),
+        frames=frames,
+        frames_done=done,
+        frames_failed=len(failed),
+        progress=settled / frames,
+        samples=int(held["samples"]),
+        tasks=int(held["tasks"]),
+        created=int(held["created"]) / 1000,
+        started=int(held["started"]) / 1000 if "started" in held else None,
+        finished=int(held["finished"]) / 1000 if "finished" in held else None,
+        seconds_left=left,
+        # By index as all else here; `Farm` puts in the frame's number.
+        reason=f"{first}: {failed[first]}" if first is not None else None,
+        active=active,
+    )

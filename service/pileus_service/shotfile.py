@@ -31,13 +31,14 @@ def parse_shot(data: Any, source: str) -> Shot:
         raise InputError(one_line(source, error)) from None
 
 
-def check_files(shot: Shot, source: str, frames: Iterable[int]) -> None:
-    """Refuses a shot whose inputs are missing or whose output cannot be written."""
+def check_files(shot: Shot, source: str, frames: Iterable[int], *, caches: bool = True) -> None:
+    """Refuses a shot whose inputs are missing or whose output cannot be written; caches may be
+    missing where they are waited for."""
     frames = list(frames)
     missing: dict[str, list[Path]] = {}
     for frame in frames:
         for field, file in shot.inputs(frame):
-            if not file.is_file():
+            if not file.is_file() and (caches or not field.startswith("volumes.")):
                 missing.setdefault(field, []).append(file)
     for field, files in missing.items():
         name = files[0]

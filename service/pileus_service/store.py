@@ -10,14 +10,14 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar, cast
 
 from pydantic import ValidationError
 
-from pileus_service.jobs import JOB_ID, Done, Job, Part, Plan, Record, Wish
+from pileus_service.jobs import JOB_ID, Cache, Done, Job, Part, Plan, Record, Wish
 
 R = TypeVar("R", bound=Record)
 
@@ -39,12 +39,17 @@ def write_whole(path: Path, data: bytes, *, once: bool = False) -> bool:
         return False
     finally:
         temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync_folder(path.parent)
     return True
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the renames in a folder last through a power cut."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 class FrameStore:
@@ -58,13 +63,6 @@ class FrameStore:
     def part(self, part: Part) -> Path:
         return self.folder / "parts" / part.name
 
-    def look_again(self) -> None:
-        """Has an NFS client ask which names there are: it may remember one as absent that another
-        host has made since, and asks anew when a folder is opened (close-to-open consistency)."""
-        for folder in (self.folder, self.folder / "parts"):
-            with contextlib.suppress(FileNotFoundError):
-                os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
-
     def plan(self) -> Plan | None:
         return _read(self.folder / "plan.json", Plan)
 
@@ -77,6 +75,13 @@ class FrameStore:
         """Forgets plan and partials, where the cache has changed under them."""
         (self.folder / "plan.json").unlink(missing_ok=True)
         self.drop_parts()
+
+    def seen(self) -> Cache | None:
+        """The cache as the last look found it, where a frame waits for it."""
+        return _read(self.folder / "seen.json", Cache)
+
+    def mark_seen(self, cache: Cache) -> None:
+        write_whole(self.folder / "seen.json", cache.model_dump_json().encode())
 
     def done(self) -> Done | None:
         return _read(self.folder / "done.json", Done)
@@ -109,9 +114,12 @@ class Store:
     def has(self, job_id: str) -> bool:
         return (self._folder(job_id) / "job.json").exists()
 
-    def job_ids(self) -> Iterator[str]:
-        for folder in sorted(self.jobs_folder.iterdir()):
-            if JOB_ID.fullmatch(folder.name) and (folder / "job.json").exists():
+    def job_ids(self, known: Container[str] = ()) -> Iterator[str]:
+        """The jobs that are here; a folder of a known one is believed to hold it."""
+        for folder in self.jobs_folder.iterdir():
+            if folder.name in known or (
+                JOB_ID.fullmatch(folder.name) and (folder / "job.json").exists()
+            ):
                 yield folder.name
 
     def wish(self, job_id: str, wish: Wish) -> None:

@@ -89,6 +89,8 @@ def worker_table(workers: Iterable[WorkerView], names: dict[str, str]) -> Table:
         doing = worker.doing
         if not worker.alive:
             state, task = Text("● gone", "red"), f"last seen {_ago(worker.seen)}"
+        elif doing is None and worker.aside is not None:
+            state, task = Text("● set aside", "yellow"), worker.aside
         elif doing is None:
             state, task = Text("● idle", "bright_black"), ""
         else:

@@ -1,22 +1,28 @@
-"""The render process: long-lived, takes orders through a pipe, dies alone.
+"""The render process: long-lived, takes orders through a pipe, dies alone, by limits of its own.
 
-It keeps the caches it has read from task to task. Its main thread answers the pipe four times a
+It keeps the caches it has read from task to task. Its main thread answers the pipe ten times a
 second, so a parent can tell a long render from a hang. All that it prints goes to its parent, which
 keeps it with the attempt.
 """
 
 import faulthandler
 import os
+import resource
 import signal
+import threading
 import time
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pileus_service.jobs import Cause, Job, Kind, Result
 from pileus_worker.paths import PathMap
+
+if TYPE_CHECKING:
+    from pileus_worker.tasks import Work
 
 TICK = 0.1
 
@@ -29,6 +35,7 @@ class Setup:
     roots: tuple[Path, ...]
     threads: int
     cache_bytes: int
+    memory_bytes: int
     task_seconds: float
     paths: PathMap
 
@@ -41,6 +48,12 @@ class Order:
     frame: int
     kind: Kind
     part: int
+    read_ahead: bool
+
+
+@dataclass(frozen=True)
+class Permit:
+    """The task is still yours: put its frame in its place."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,11 @@ class Spent:
 
 
 @dataclass(frozen=True)
+class Ready:
+    """A frame is whole, and waits for a Permit."""
+
+
+@dataclass(frozen=True)
 class Finished:
     result: Result
     spent: Spent
@@ -77,62 +95,123 @@ class Failed:
     spent: Spent = Spent()
 
 
+Message = Beat | Ready | Finished | Failed
+
+
 def run(pipe: "Connection[Any, Any]", output: "Connection[Any, Any]", setup: Setup) -> None:
     """The child's life, from its start to the end of its pipe."""
     for stream in (1, 2):
         os.dup2(output.fileno(), stream)
     faulthandler.enable()
-    # Heavy, and only of use in the child: the supervisor must survive what happens in here.
-    from pileus_service.roots import Roots
-    from pileus_service.store import Store
-    from pileus_worker.caches import Caches
     from pileus_worker.lifeline import die_with_parent
-    from pileus_worker.tasks import Work
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
-    store, roots = Store(setup.data), Roots(setup.roots, setup.data)
-    caches = Caches(setup.cache_bytes, setup.paths, roots.reading)
-    executor = ThreadPoolExecutor(1, thread_name_prefix="task")
+    _limit(setup)
     try:
-        while True:
-            order = pipe.recv()
-            if isinstance(order, Cancel):
-                continue  # came too late for the task that it meant
-            work = Work(
-                store,
-                roots,
-                caches,
-                setup.threads,
-                setup.task_seconds,
-                order.job,
-                order.frame,
-                order.kind,
-                order.part,
-                setup.paths,
-            )
-            cpu, read = time.process_time(), caches.bytes_read
-            future = executor.submit(work.run)
-            while not wait([future], TICK).done:
-                if pipe.poll():
-                    pipe.recv()
-                    work.control.cancel()
-                pipe.send(Beat(work.control.samples_done))
-            spent = Spent(time.process_time() - cpu, caches.bytes_read - read, work.phases)
-            pipe.send(_outcome(future, spent))
+        Life(pipe, setup).live()
     except (EOFError, BrokenPipeError, ConnectionResetError):
         os._exit(0)  # the parent is gone; nothing here is worth a tidy end
 
 
-def _outcome(future: "Future[Result]", spent: Spent) -> Finished | Failed:
-    error = future.exception()
-    if error is None:
-        return Finished(future.result(), spent)
-    if isinstance(error, MemoryError):
-        return Failed("out of memory", Cause.MEMORY, spent)
+def _outcome(work: "Work", spent: Callable[[], Spent]) -> Finished | Failed:
     # A RuntimeError is the core's word for what it could not write.
     causes = ((ValueError, Cause.INPUT), (OSError, Cause.DISK), (RuntimeError, Cause.DISK))
-    for kind, cause in causes:
-        if isinstance(error, kind):
-            return Failed(str(error), cause, spent)
-    return Failed(f"{type(error).__name__}: {error}", Cause.ERROR, spent)
+    try:
+        return Finished(work.run(), spent())
+    except MemoryError:
+        return Failed("out of memory", Cause.MEMORY, spent())
+    except Exception as error:
+        for kind, cause in causes:
+            if isinstance(error, kind):
+                return Failed(str(error), cause, spent())
+        return Failed(f"{type(error).__name__}: {error}", Cause.ERROR, spent())
+
+
+def _limit(setup: Setup) -> None:
+    """The parent looks at our memory now and then; this stops what grows faster than it looks.
+    Stacks and code are not rendering's, so there is some room beyond."""
+    most = setup.memory_bytes + (512 << 20) + setup.threads * (16 << 20)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+class Life:
+    """Does a task in a thread while the main thread talks with the parent."""
+
+    def __init__(self, pipe: "Connection[Any, Any]", setup: Setup) -> None:
+        # Heavy, and only of use in the child: the supervisor must survive what happens in here.
+        from pileus_service.roots import Roots
+        from pileus_service.store import Store
+        from pileus_worker.caches import Caches
+
+        self._pipe = pipe
+        self._setup = setup
+        self._store, self._roots = Store(setup.data), Roots(setup.roots, setup.data)
+        self._caches = Caches(setup.cache_bytes, setup.paths, self._roots.reading)
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="task")
+        self._work: Work | None = None
+        self._saying = threading.Lock()
+        self._permitted = threading.Event()
+        self._denied = False
+
+    def live(self) -> None:
+        while True:
+            work = self._work
+            if not self._pipe.poll(TICK):
+                if work is not None:
+                    self._say(Beat(work.control.samples_done))
+                continue
+            message = self._pipe.recv()
+            if isinstance(message, Order):
+                self._permitted.clear()
+                self._denied = False
+                self._work = self._begin(message)
+                self._executor.submit(self._do, self._work)
+            elif isinstance(message, Permit):
+                self._permitted.set()
+            elif work is not None:
+                work.control.cancel()
+                self._denied = True
+                self._permitted.set()
+
+    def _begin(self, order: Order) -> "Work":
+        from pileus_worker.tasks import Work
+
+        return Work(
+            self._store,
+            self._roots,
+            self._caches,
+            self._setup.threads,
+            self._setup.task_seconds,
+            order.job,
+            order.frame,
+            order.kind,
+            order.part,
+            self._setup.paths,
+            self._await_permit,
+            order.read_ahead,
+        )
+
+    def _do(self, work: "Work") -> None:
+        cpu, read = time.process_time(), self._caches.bytes_read
+
+        def spent() -> Spent:
+            taken = self._caches.bytes_read - read
+            return Spent(time.process_time() - cpu, taken, work.phases)
+
+        outcome = _outcome(work, spent)
+        self._work = None
+        self._say(outcome)
+
+    def _await_permit(self) -> None:
+        """Waits until the parent knows that the lease is ours; if it is not, the task is over."""
+        self._say(Ready())
+        self._permitted.wait()
+        if self._denied:
+            raise RuntimeError("the task is another's by now")
+
+    def _say(self, message: Message) -> None:
+        with self._saying:
+            self._pipe.send(message)

@@ -2,8 +2,6 @@
 
 import contextlib
 import fcntl
-import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -20,8 +18,6 @@ from pileus_worker.commands.worker import TASK_SECONDS
 from pileus_worker.lifeline import die_with_parent
 from pileus_worker.private_redis import PrivateRedis
 
-LOG_BYTES = 64 << 20
-
 
 class Workers:
     """The worker processes; one that dies is replaced."""
@@ -32,16 +28,10 @@ class Workers:
         self._processes = [self._start() for _ in range(count)]
 
     def keep_up(self) -> None:
-        """Replaces those that have died, and keeps their log within its bound."""
+        """Replaces those that have died."""
         self._processes = [
             process if process.poll() is None else self._start() for process in self._processes
         ]
-        if os.fstat(self._log.fileno()).st_size > LOG_BYTES:
-            # They append to the open file: it is emptied in place, its lines kept once more.
-            path = Path(self._log.name)
-            with contextlib.suppress(OSError):  # on a full disk the farm matters more
-                shutil.copyfile(path, path.with_suffix(".old.log"))
-            os.ftruncate(self._log.fileno(), 0)
 
     def end(self) -> None:
         """Tells all to end, and sees to it."""
@@ -129,6 +119,7 @@ def _command(
     memory = machine.memory_bytes() / count / (1 << 30)
     command = [sys.executable, "-m", "pileus_worker", "--data", str(data), "--redis", redis_url]
     command += [f"--threads={threads}", f"--memory={memory:.3f}", f"--task-seconds={task_seconds}"]
+    command += ["--grace=0"]  # a person waits
     return [*command, *(f"--root={root}" for root in roots)]
 
 

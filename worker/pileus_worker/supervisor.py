@@ -4,7 +4,9 @@ Leases are renewed here, never by the renderer: whatever happens in the child (a
 memory) is a failed attempt, and the worker goes on with a new child.
 """
 
+import contextlib
 import logging
+import math
 import multiprocessing
 import os
 import random
@@ -28,7 +30,7 @@ from tenacity import (
 )
 from tenacity.wait import wait_random_exponential
 
-from pileus_service.jobs import Cause, Job, Task, WorkerInfo
+from pileus_service.jobs import Cause, Job, Kind, Task, WorkerInfo
 from pileus_service.measures import Measures
 from pileus_service.queue import RENEWAL, Queue
 from pileus_service.store import Store
@@ -42,17 +44,40 @@ log = structlog.stdlib.get_logger(__name__)
 IDLE = 0.2
 LOOK = 0.5
 SILENCE = 30.0
-GRACE = 1.0
+PATIENCE = 1.0
+# After these a child is replaced, and they may be the fault of a cache that was read ahead.
+UNSOUND = (Cause.CRASH, Cause.HANG, Cause.MEMORY)
 
 
 @dataclass
 class Limits:
-    """What a child may use, and how long the tasks that it plans are to be."""
+    """What a child may use, how long the tasks that it plans are to be, and for how long it may
+    get nowhere: reading a cache over a slow network takes its time, a hang takes for ever."""
 
     threads: int
     cache_bytes: int
     memory_bytes: int
     task_seconds: float
+    stall_seconds: float
+
+
+class Ending:
+    """Whether and how soon a worker is to end: its task may finish within the grace, in seconds."""
+
+    def __init__(self, grace: float) -> None:
+        self._grace = grace
+        self._at = math.inf
+        self.asked = threading.Event()
+
+    def ask(self, *, at_once: bool = False) -> None:
+        """A second request is an impatient one."""
+        impatient = at_once or self.asked.is_set()
+        self._at = time.monotonic() + (0.0 if impatient else self._grace)
+        self.asked.set()
+
+    @property
+    def overdue(self) -> bool:
+        return time.monotonic() >= self._at
 
 
 class ChildLostError(Exception):
@@ -83,11 +108,15 @@ class Child:
         except OSError:
             raise ChildLostError(self._how_it_ended()) from None
 
-    def hear(self, seconds: float) -> child.Beat | child.Finished | child.Failed | None:
+    def permit(self) -> None:
+        with contextlib.suppress(OSError):  # its end is heard of next
+            self._pipe.send(child.Permit())
+
+    def hear(self, seconds: float) -> child.Message | None:
         """What the child says within a time, or None."""
         try:
             if self._pipe.poll(seconds):
-                message: child.Beat | child.Finished | child.Failed = self._pipe.recv()
+                message: child.Message = self._pipe.recv()
                 self._heard = time.monotonic()
                 return message
         except (EOFError, OSError):
@@ -100,7 +129,7 @@ class Child:
         """Stops the task; False if the child did not stop in time and must be killed."""
         try:
             self._pipe.send(child.Cancel())
-            end = time.monotonic() + GRACE
+            end = time.monotonic() + PATIENCE
             while time.monotonic() < end:
                 if isinstance(self.hear(0.05), child.Finished | child.Failed):
                     return True
@@ -122,7 +151,7 @@ class Child:
         self._pipe.close()
 
     def _how_it_ended(self) -> str:
-        self._process.join(GRACE)
+        self._process.join(PATIENCE)
         code = self._process.exitcode
         if code is not None and code < 0:
             return f"the render process died of signal {-code}"
@@ -145,7 +174,13 @@ class Supervisor:
         self._store = store
         self._limits = limits
         self._setup = child.Setup(
-            store.root, roots, limits.threads, limits.cache_bytes, limits.task_seconds, paths
+            store.root,
+            roots,
+            limits.threads,
+            limits.cache_bytes,
+            limits.memory_bytes,
+            limits.task_seconds,
+            paths,
         )
         host = socket.gethostname()
         self.info = WorkerInfo(
@@ -157,12 +192,15 @@ class Supervisor:
         )
         self._child: Child | None = None
         self._output = Output()
+        # Jobs whose next cache is not read ahead: a child was lost that did so.
+        self._wary: set[str] = set()
 
-    def run(self, stop: threading.Event) -> None:
-        """Works until told to stop; a task in hand is handed back."""
+    def run(self, ending: Ending) -> None:
+        """Works until told to end; a task in hand is finished within the grace or handed back."""
         structlog.contextvars.bind_contextvars(worker=self.info.name)
         try:
-            while not stop.is_set():
+            while not ending.asked.is_set():
+                asked_at = time.monotonic()
                 try:
                     task = self._queue.claim(self.info)
                 except RedisError as error:
@@ -170,9 +208,9 @@ class Supervisor:
                     log.warning("no tasks to be had", reason=str(error))
                     task = None
                 if task is None:
-                    stop.wait(IDLE * random.uniform(0.5, 1.5))
+                    ending.asked.wait(IDLE * random.uniform(0.5, 1.5))
                 else:
-                    self._attempt(task, stop)
+                    self._attempt(task, asked_at, ending)
             try:
                 self._queue.leave(self.info.name)
             except RedisError:
@@ -180,37 +218,54 @@ class Supervisor:
         finally:
             self._drop_child()
 
-    def _attempt(self, task: Task, stop: threading.Event) -> None:
+    def _attempt(self, task: Task, leased: float, ending: Ending) -> None:
+        """Does a task whose lease began at `leased`, and says how that went."""
         try:
             job = self._store.job(task.job)
             if job is None:
                 raise FileNotFoundError(f"{self._store.root}: has no job {task.job}")
         except OSError as error:
             log.warning("cannot begin", job=task.job, task=task.label, reason=str(error))
-            self._tell(task, child.Failed(str(error), Cause.DISK), stop)
+            self._tell(task, child.Failed(str(error), Cause.DISK), ending)
             return
         frame = job.shot.frame_numbers[task.frame]
         with structlog.contextvars.bound_contextvars(
             job=task.job, frame=frame, task=task.label, attempt=task.attempt
         ):
-            begun = time.monotonic()
-            log.info("begun")
-            outcome = self._do(job, frame, task, stop)
-            self._note(task, outcome, time.monotonic() - begun)
-            self._tell(task, outcome, stop)
+            outcome = self._try(job, frame, task, leased, ending)
+            ahead = task.kind is Kind.RENDER and task.job not in self._wary
+            if ahead and isinstance(outcome, child.Failed) and outcome.cause in UNSOUND:
+                # It may have been the next frame's cache that the child died of.
+                log.info("once more, without reading ahead")
+                self._wary.add(task.job)
+                outcome = self._try(job, frame, task, leased, ending)
+            self._tell(task, outcome, ending)
+
+    def _try(
+        self, job: Job, frame: int, task: Task, leased: float, ending: Ending
+    ) -> child.Finished | child.Failed | None:
+        begun = time.monotonic()
+        log.info("begun")
+        outcome = self._do(job, frame, task, leased, ending)
+        self._note(task, outcome, time.monotonic() - begun)
+        return outcome
 
     def _do(
-        self, job: Job, frame: int, task: Task, stop: threading.Event
+        self, job: Job, frame: int, task: Task, leased: float, ending: Ending
     ) -> child.Finished | child.Failed | None:
         """Has the child do a task; whatever becomes of the child is the task's outcome."""
         try:
             if self._child is None:
                 self._child = Child(self._setup, self._output)
-            self._child.order(child.Order(job, frame, task.kind, task.part))
-            return self._watch(self._child, task, stop)
+            ahead = task.job not in self._wary
+            self._child.order(child.Order(job, frame, task.kind, task.part, ahead))
+            outcome = self._watch(self._child, task, leased, ending)
         except (ChildLostError, OSError) as error:
             self._drop_child()
             return child.Failed(str(error), getattr(error, "cause", Cause.DISK))
+        if isinstance(outcome, child.Failed) and outcome.cause in UNSOUND:
+            self._drop_child()
+        return outcome
 
     def _note(
         self, task: Task, outcome: child.Finished | child.Failed | None, seconds: float
@@ -229,69 +284,91 @@ class Supervisor:
             log.info("done" if outcome else "given up", **told)
 
     def _tell(
-        self, task: Task, outcome: child.Finished | child.Failed | None, stop: threading.Event
+        self, task: Task, outcome: child.Finished | child.Failed | None, ending: Ending
     ) -> None:
         try:
             if isinstance(outcome, child.Finished):
                 tell = self._queue.complete
-                if not self._insist(stop)(tell, task, self.info.name, outcome.result):
+                if not self._insist(ending)(tell, task, self.info.name, outcome.result):
                     log.warning("done, but another has the lease; the file counts")
             elif isinstance(outcome, child.Failed):
-                self._insist(stop)(self._queue.fail, task, self.info.name, outcome.reason)
+                self._insist(ending)(self._queue.fail, task, self.info.name, outcome.reason)
         except RetryError:
             log.warning("Redis was not there to be told")
 
     def _watch(
-        self, renderer: Child, task: Task, stop: threading.Event
+        self, renderer: Child, task: Task, leased: float, ending: Ending
     ) -> child.Finished | child.Failed | None:
         """Sees a task through; None if it was given up because nobody wants it from us."""
-        samples = 0
+        samples, moved = -1, time.monotonic()  # its first word, once it has started, is a move
         renewal, look = time.monotonic(), time.monotonic() + LOOK
+        ready = False
         while True:
             message = renderer.hear(0.1)
             self._output.drain()
             if isinstance(message, child.Finished | child.Failed):
                 return message
-            if message is not None:
-                samples = message.samples
             now = time.monotonic()
+            if isinstance(message, child.Ready):
+                ready, renewal, moved = True, now, now
+            elif message is not None and message.samples != samples:
+                samples, moved = message.samples, now
             try:
-                if stop.is_set():
+                if ending.overdue:
                     self._stop_child(renderer)
                     self._queue.hand_back(task, self.info.name)
                     return None
                 if now >= renewal:
-                    renewal = now + RENEWAL
-                    told = self.info.model_copy(update={"task": task, "samples": samples})
-                    if not self._queue.renew(task, told):
-                        log.warning("another has the lease; dropped")
-                        self._stop_child(renderer)
+                    told = self.info.model_copy(update={"task": task, "samples": max(0, samples)})
+                    if (standing := self._queue.renew(task, told)) != "held":
+                        log.warning("dropped", lease=standing)
+                        self._give_up(renderer, task)
                         return None
+                    leased, renewal = now, now + RENEWAL
+                    if ready:
+                        renderer.permit()
+                        ready = False
                 if now >= look:
                     look = now + LOOK
                     if self._queue.state(task.job) not in ("running", "paused"):
-                        self._stop_child(renderer)
-                        self._queue.hand_back(task, self.info.name)
+                        self._give_up(renderer, task)
                         return None
             except RedisError as error:
-                # The work stays good: the lease is renewed, or found lost, when Redis is back.
                 log.warning("going on without Redis", reason=str(error))
-                if stop.is_set():
+                if ending.asked.is_set():
                     return None
-            used = renderer.memory()
-            if used > self._limits.memory_bytes:
-                raise ChildLostError(
-                    f"the render process used {used >> 20} MiB of memory, over the "
-                    f"{self._limits.memory_bytes >> 20} MiB it may; give the worker more",
-                    Cause.MEMORY,
-                )
+            if time.monotonic() - leased > self._queue.lease:
+                # Another has it by now, or will: nobody is to do one thing twice at a time.
+                log.warning("dropped: no word from Redis for as long as a lease")
+                self._stop_child(renderer)
+                return None
+            self._keep_within_limits(renderer, now - moved)
 
-    def _insist(self, stop: threading.Event) -> Retrying:
+    def _keep_within_limits(self, renderer: Child, still: float) -> None:
+        used = renderer.memory()
+        if used > self._limits.memory_bytes:
+            raise ChildLostError(
+                f"the render process used {used >> 20} MiB of memory, over the "
+                f"{self._limits.memory_bytes >> 20} MiB it may; give the worker more",
+                Cause.MEMORY,
+            )
+        if still > self._limits.stall_seconds:
+            raise ChildLostError(
+                f"the render process got nowhere for {still:.0f} s; give a slow disk more with "
+                "--stall-seconds",
+                Cause.HANG,
+            )
+
+    def _give_up(self, renderer: Child, task: Task) -> None:
+        self._stop_child(renderer)
+        self._queue.hand_back(task, self.info.name)
+
+    def _insist(self, ending: Ending) -> Retrying:
         """Tries until Redis is back: what was done must be said, unless we are to end."""
         return Retrying(
             retry=retry_if_exception_type(RedisError),
             wait=wait_random_exponential(max=2),
-            stop=stop_when_event_set(stop),
+            stop=stop_when_event_set(ending.asked),
             before_sleep=before_sleep_log(logging.getLogger(__name__), logging.WARNING),
         )
 

@@ -1,14 +1,15 @@
 """What a render child does: plans a frame, renders a part of one, merges one."""
 
 import contextlib
+import os
+import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pileus_core as core
 
-from pileus_service.errors import InputError
 from pileus_service.jobs import (
     Bucket,
     Cache,
@@ -16,23 +17,37 @@ from pileus_service.jobs import (
     Job,
     Kind,
     Merged,
+    Part,
     Plan,
     Planned,
     Rendered,
     Replan,
     Result,
+    Stale,
+    Waiting,
 )
 from pileus_service.roots import Roots
-from pileus_service.store import FrameStore, Store
+from pileus_service.store import FrameStore, Store, sync_folder
 from pileus_worker import planning, scene
 from pileus_worker.caches import Caches
 from pileus_worker.paths import PathMap
 from pileus_worker.pictures import write_preview
 
+# A cache that nobody has written to for so long is whole.
+SETTLED_SECONDS = 60.0
+
+
+class StaleError(Exception):
+    """The plan speaks of a cache that is there no longer."""
+
 
 @dataclass
 class Work:
-    """One task, with all it needs to be done in."""
+    """One task, with all it needs to be done in.
+
+    `permit` is called before a frame is put in its place, and raises unless the task is still
+    ours: a worker that was frozen must not write over what others have done since.
+    """
 
     store: Store
     roots: Roots
@@ -44,33 +59,54 @@ class Work:
     kind: Kind
     part: int
     paths: PathMap
+    permit: Callable[[], None]
+    read_ahead: bool
     control: core.Control = field(default_factory=core.Control)
     phases: dict[str, float] = field(default_factory=dict)
 
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
         files = self.store.frame(self.job.id, self.frame)
-        files.look_again()
-        if self.kind is Kind.PLAN:
-            return self._plan(files)
-        plan = files.plan()
-        if plan is None:
-            raise InputError(f"frame {self.frame}: its plan is gone from the data folder")
-        if plan.identity != scene.identity(self.job.shot, self.frame, plan.cache):
-            return Replan()
-        if self.kind is Kind.RENDER:
-            return self._render(files, plan)
-        return self._merge(files, plan)
+        if files.done() is not None:
+            return self._already_done(files)
+        try:
+            if self.kind is Kind.PLAN:
+                return self._plan(files)
+            plan = files.plan()
+            if plan is None:
+                return Stale(stale=f"frame {self.frame}: its plan is gone from the data folder")
+            if plan.identity != scene.identity(self.job.shot, self.frame, plan.cache):
+                return Replan()
+            if self.kind is Kind.RENDER:
+                return self._render(files, plan)
+            return self._merge(files, plan)
+        except StaleError as error:
+            return Stale(stale=str(error))
 
-    def _plan(self, files: FrameStore) -> Planned:
+    def _already_done(self, files: FrameStore) -> Result:
+        """What Redis forgot, or an attempt that died before it could say so or clean up."""
+        self._tidy(files)
+        if self.kind is Kind.PLAN:
+            return Planned(tasks=0, finished=[], total=0, samples=0)
+        return Rendered(samples=0) if self.kind is Kind.RENDER else Merged()
+
+    def _plan(self, files: FrameStore) -> Planned | Waiting:
         """Makes the frame's plan, or takes up one that is there, with what it has finished."""
+        if self.job.wait_for_caches and (trouble := self._unready(files)):
+            return Waiting(wait=trouble)
         cache = scene.cache_of(self.job.shot, self.frame, self.paths)
         identity = scene.identity(self.job.shot, self.frame, cache)
         plan = files.plan()
         if plan is not None and plan.identity != identity:
             files.drop_plan()
             plan = None
-        plan = plan or files.keep_plan(self._new_plan(cache, identity))
+        if plan is None:
+            try:
+                plan = files.keep_plan(self._new_plan(cache, identity))
+            except core.InputError as error:
+                if self.job.wait_for_caches and not _settled(cache):
+                    return Waiting(wait=str(error))
+                raise
         finished = [i for i, part in enumerate(plan.parts) if files.part(part).exists()]
         return Planned(
             tasks=len(plan.parts),
@@ -78,6 +114,17 @@ class Work:
             total=sum(part.pixel_samples for part in plan.parts),
             samples=sum(plan.parts[i].pixel_samples for i in finished),
         )
+
+    def _unready(self, files: FrameStore) -> str | None:
+        """Why the cache is not to be read yet: it is absent, or has changed since the last look."""
+        path = scene.cache_path(self.paths.shot(self.job.shot), self.frame)
+        if not path.exists():
+            return f"volumes.0.cache: {path} is not there yet"
+        cache = scene.cache_of(self.job.shot, self.frame, self.paths)
+        if _settled(cache) or files.seen() == cache:
+            return None
+        files.mark_seen(cache)
+        return f"volumes.0.cache: {path} may still be in the making"
 
     def _new_plan(self, cache: Cache, identity: str) -> Plan:
         begun = time.time()
@@ -107,19 +154,21 @@ class Work:
     def _render(self, files: FrameStore, plan: Plan) -> Rendered:
         part = plan.parts[self.part]
         path = files.part(part)
-        if not _whole(path, plan.identity):
+        if not self._whole(files, part, plan):
             view = self._scene(plan.cache)
-            self._read_ahead()
-            path.parent.mkdir(parents=True, exist_ok=True)
+            if self.read_ahead:
+                self._begin_next()
+            # Only where the frame's folder is: a job that was removed leaves nothing behind.
+            path.parent.mkdir(exist_ok=True)
             partial = self._samples(view, part.bucket, part.samples)
             with self._phase("write"):
                 partial.write(str(path), plan.identity)
+            if files.done() is not None:
+                self._tidy(files)  # we were late, and others have swept already
         return Rendered(samples=part.pixel_samples)
 
     def _merge(self, files: FrameStore, plan: Plan) -> Merged:
         """Writes the image from the partials; those missing or damaged are to be made again."""
-        if files.done() is not None:
-            return Merged()
         shot = self.job.shot
         samples = shot.sampling.samples
         buckets = [*dict.fromkeys(part.bucket for part in plan.parts), *plan.empty]
@@ -130,7 +179,7 @@ class Work:
         with self._phase("merge"):
             for index, part in enumerate(plan.parts):
                 try:
-                    partial = _read(files.part(part), plan.identity)
+                    partial = self._read(files, part, plan)
                 except core.InputError as error:
                     redo.append(index)
                     trouble = str(error)
@@ -155,12 +204,17 @@ class Work:
     def _write(self, files: FrameStore, frame: core.Frame, seconds: float) -> None:
         shot = self.job.shot
         transport = scene.make_transport(shot)
-        with self.roots.writing(self.paths.shot(shot).output(self.frame)) as location:
+        place = self.roots.writing(self.paths.shot(shot).output(self.frame))
+        staging = self.roots.writing(self._staging / f"{os.getpid()}.exr")
+        with place as location, staging as staged:
             frame.write(
-                location,
+                staged,
                 half=shot.image.pixel_type == "half",
                 header=scene.header(shot, self.frame, transport, seconds),
             )
+            self.permit()
+            Path(staged).replace(location)
+            sync_folder(Path(location).parent)
         write_preview(files.preview, frame.pixels(shot.transport.looks[0].name))
         files.mark_done(
             Done(
@@ -173,16 +227,56 @@ class Work:
                 reason=scene.reason(shot),
             )
         )
+        self._tidy(files)
+
+    @property
+    def _staging(self) -> Path:
+        """Where the frame's image is written before it is renamed: beside it, to be one rename
+        away, and a folder, so that what a killed attempt left there is found without a search."""
+        output = self.paths.shot(self.job.shot).output(self.frame)
+        return output.parent / f".{self.job.id}.{self.frame}"
+
+    def _tidy(self, files: FrameStore) -> None:
+        """Sweeps, once the frame is done, what its attempts have left."""
         files.drop_parts()
+        shutil.rmtree(self._staging, ignore_errors=True)
 
     def _scene(self, cache: Cache) -> core.Scene:
-        now = scene.cache_of(self.job.shot, self.frame, self.paths)
-        if now != cache:
-            raise InputError(f"{cache.path}: has changed since its frame was planned; submit again")
-        with self._phase("load"):
-            volume = self.caches.get(cache, self.job.shot.volumes[0].density)
+        """The scene with the volume as it was planned: asked before and after it is read, so that
+        no frame is of two caches."""
+        try:
+            self._same(cache)
+            with self._phase("load"):
+                volume = self.caches.get(cache, self.job.shot.volumes[0].density)
+        finally:
+            self._same(cache)
         shot = self.paths.shot(self.job.shot)
         return scene.make_scene(shot, self.frame, volume, self.roots.reading)
+
+    def _same(self, cache: Cache) -> None:
+        if scene.cache_of(self.job.shot, self.frame, self.paths) != cache:
+            raise StaleError(f"{cache.path}: changes while its frame is rendered")
+
+    def _whole(self, files: FrameStore, part: Part, plan: Plan) -> bool:
+        """Whether a partial is there already, from an attempt whose completion was not heard."""
+        try:
+            return files.part(part).exists() and bool(self._read(files, part, plan))
+        except core.InputError:
+            return False
+
+    def _read(self, files: FrameStore, part: Part, plan: Plan) -> core.Partial:
+        """A partial of this very frame; a damaged or foreign one is removed, to be made again."""
+        path = files.part(part)
+        try:
+            partial = core.Partial.read(str(path))
+            if partial.identity != plan.identity:
+                raise core.InputError(f"{path}: is of another frame or shot")
+        except core.InputError:
+            if (holds := files.plan()) is None or holds.identity != plan.identity:
+                raise StaleError(f"frame {self.frame}: has been planned anew") from None
+            path.unlink(missing_ok=True)
+            raise
+        return partial
 
     def _samples(self, view: core.Scene, bucket: Bucket, samples: tuple[int, int]) -> core.Partial:
         shot = self.job.shot
@@ -208,7 +302,7 @@ class Work:
         finally:
             self.phases[name] = self.phases.get(name, 0.0) + time.perf_counter() - begun
 
-    def _read_ahead(self) -> None:
+    def _begin_next(self) -> None:
         """Begins to read the next frame's cache; if that cannot be, its own task will say so."""
         shot = self.job.shot
         later = [frame for frame in shot.frame_numbers if frame > self.frame]
@@ -217,24 +311,5 @@ class Work:
             self.caches.read_ahead(cache, shot.volumes[0].density)
 
 
-def _whole(path: Path, identity: str) -> bool:
-    """Whether a partial is there already, from an attempt whose completion was not heard."""
-    if not path.exists():
-        return False
-    try:
-        _read(path, identity)
-    except core.InputError:
-        return False
-    return True
-
-
-def _read(path: Path, identity: str) -> core.Partial:
-    """A partial of this very frame; a damaged or foreign one is removed, to be made again."""
-    try:
-        partial = core.Partial.read(str(path))
-        if partial.identity != identity:
-            raise core.InputError(f"{path}: is of another frame or shot")
-    except core.InputError:
-        path.unlink(missing_ok=True)
-        raise
-    return partial
+def _settled(cache: Cache) -> bool:
+    return time.time() - cache.mtime_ns / 1e9 > SETTLED_SECONDS

@@ -1,68 +1,138 @@
 -- Gives the worker ARGV[2] (described by ARGV[3]) its next task: by priority, and in each stream
 -- those whose lease ran out before new ones. Returns {priority, id, attempt, job, frame, kind, part}.
+local SWEEP = 250 -- milliseconds between looks for leases that ran out
 local worker, info = ARGV[2], ARGV[3]
-greet(worker, info)
+
+local function each_stream(act)
+  for priority = 9, 0, -1 do
+    local stream = stream_of(priority)
+    if redis.call('EXISTS', stream) == 1 then act(stream) end
+  end
+end
+
+local function each_pending(stream, idle, act)
+  local from = '-'
+  while true do
+    local page = redis.call('XPENDING', stream, GROUP, 'IDLE', idle, from, '+', 128)
+    for _, pending in ipairs(page) do act(pending[1], pending[2]) end
+    if #page < 128 then return end
+    from = '(' .. page[#page][1]
+  end
+end
+
+-- A clock set back would make each lease last that much longer: all begin anew from here.
+local function begin_leases_anew(time)
+  each_stream(function(stream)
+    each_pending(stream, 0, function(id, owner)
+      redis.call('XCLAIM', stream, GROUP, owner, 0, id, 'IDLE', 0, 'JUSTID')
+    end)
+  end)
+  for key, most in pairs({ ['pileus:alive'] = 0, ['pileus:due'] = 0, ['pileus:aside'] = ASIDE }) do
+    for _, member in ipairs(redis.call('ZRANGEBYSCORE', key, '(' .. time + most, '(+inf')) do
+      redis.call('ZADD', key, time + most, member)
+    end
+  end
+end
+
+-- Takes leases that ran out from those that held them.
+local function take_expired()
+  each_stream(function(stream)
+    each_pending(stream, LEASE, function(id, owner)
+      if owner == RELEASED then return end
+      record_try(stream, id, owner, 'stopped answering')
+      count('leases_lost')
+      redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'JUSTID')
+      local task = read(stream, id)
+      if task then land(task.job, owner) end
+    end)
+  end)
+end
+
+-- Looks again for the caches that frames wait for.
+local function wake(time)
+  for _, member in ipairs(redis.call('ZRANGEBYSCORE', 'pileus:due', '-inf', time, 'LIMIT', 0, 64)) do
+    local job, frame = member:match('^(%S+) (%d+)$')
+    local state = redis.call('HGET', job_of(job), 'state')
+    if state == 'paused' then
+      redis.call('ZADD', 'pileus:due', time + 5000, member)
+    else
+      redis.call('ZREM', 'pileus:due', member)
+      if redis.call('HDEL', job_of(job) .. ':waiting', frame) == 1 and state == 'running' then
+        open_frame(job, frame, 0)
+      end
+    end
+  end
+end
+
+local function look_around()
+  local time, last = now(), tonumber(redis.call('GET', 'pileus:clock') or 0)
+  if time >= last and time < last + SWEEP then return end
+  redis.call('SET', 'pileus:clock', time)
+  if time < last - 1000 then begin_leases_anew(time) end
+  take_expired()
+  wake(time)
+end
 
 local function given(priority, id, attempt, task)
   redis.call('HSETNX', job_of(task.job), 'started', now())
   return { priority, id, attempt, task.job, task.frame, task.kind, task.part }
 end
 
-local function reclaim(priority, stream)
+-- Puts a paused job's task aside until it is resumed.
+local function hold(stream, id, task)
+  redis.call('RPUSH', job_of(task.job) .. ':held', cjson.encode({ task.frame, task.kind, task.part }))
+  retire(stream, id)
+end
+
+local function take_released(priority, stream)
   local from = '-'
   while true do
-    local expired = redis.call('XPENDING', stream, GROUP, 'IDLE', LEASE, from, '+', 32)
-    for _, pending in ipairs(expired) do
-      local id, owner, attempts = pending[1], pending[2], pending[4]
+    local page = redis.call('XPENDING', stream, GROUP, from, '+', 32, RELEASED)
+    for _, pending in ipairs(page) do
+      local id, attempts = pending[1], pending[4]
       local task = read(stream, id)
       if not task then
         redis.call('XACK', stream, GROUP, id)
-      elseif readable(task) and not wanted(task) then
-        discard(stream, id, task.job)
-      elseif readable(task) and redis.call('HGET', job_of(task.job), 'state') == 'running' then
-        if owner ~= RELEASED then
-          record_try(stream, id, owner, 'stopped answering')
-          count('leases_lost')
-          redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'JUSTID')
-        end
+      elseif not readable(task) then
+        -- A newer worker's: it stays where it is.
+      elseif not wanted(task) then
+        retire(stream, id)
+      elseif redis.call('HGET', job_of(task.job), 'state') == 'paused' then
+        hold(stream, id, task)
+      else
         local fate = suits(task, worker) and verdict(stream, id, task, attempts, worker)
         if fate == 'park' then
           park(stream, id, task)
         elseif fate == 'take' then
-          redis.call('XCLAIM', stream, GROUP, worker, LEASE, id)
+          redis.call('XCLAIM', stream, GROUP, worker, 0, id)
           return given(priority, id, attempts + 1, task)
         end
       end
       from = '(' .. id
     end
-    if #expired < 32 then return nil end
+    if #page < 32 then return nil end
   end
 end
 
 -- An entry that was delivered to us, and is for a newer worker or one of another version.
 local function leave_to_others(stream, id)
-  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'RETRYCOUNT', 0, 'JUSTID')
+  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'RETRYCOUNT', 0, 'JUSTID')
 end
 
 local function take_new(priority, stream)
   while true do
     local reply = redis.call('XREADGROUP', 'GROUP', GROUP, worker, 'COUNT', 1, 'STREAMS', stream, '>')
     if not reply then return nil end
-    local id = reply[1][2][1][1]
-    local task = read(stream, id)
+    local id, flat = unpack(reply[1][2][1])
+    local task = paired(flat)
     local state, gen = unpack(redis.call('HMGET', job_of(task.job), 'state', 'gen'))
     if not readable(task) then
       leave_to_others(stream, id)
-    elseif gen ~= task.gen then
-      -- A copy went to another stream when the job's priority changed; this one counts for nothing.
-      redis.call('XACK', stream, GROUP, id)
-      redis.call('XDEL', stream, id)
-    elseif not wanted(task) then
-      discard(stream, id, task.job)
+    elseif gen ~= task.gen or not wanted(task) then
+      -- Nobody waits for it; or a copy went to another stream when the job's priority changed.
+      retire(stream, id)
     elseif state == 'paused' then
-      redis.call('RPUSH', job_of(task.job) .. ':held', cjson.encode({ task.frame, task.kind, task.part }))
-      redis.call('XACK', stream, GROUP, id)
-      redis.call('XDEL', stream, id)
+      hold(stream, id, task)
     elseif not suits(task, worker) then
       leave_to_others(stream, id)
     else
@@ -71,10 +141,17 @@ local function take_new(priority, stream)
   end
 end
 
+greet(worker, info)
+look_around()
+if aside(worker) then return nil end
 for priority = 9, 0, -1 do
   local stream = stream_of(priority)
   if redis.call('EXISTS', stream) == 1 then
-    local task = reclaim(priority, stream) or take_new(priority, stream)
+    local task = take_released(priority, stream) or take_new(priority, stream)
+    if not task and redis.call('EXISTS', ring_of(priority)) == 1 then
+      refill(priority)
+      task = take_new(priority, stream)
+    end
     if task then return task end
   end
 end

@@ -4,16 +4,18 @@
 local worker, stream, id, reason = ARGV[2], stream_of(ARGV[3]), ARGV[4], ARGV[5]
 local pending = owned(stream, id, worker)
 if not pending then return 'lost' end
-local attempts = pending[4]
-if reason == '' then
-  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'RETRYCOUNT', attempts - 1, 'JUSTID')
-  return 'released'
+local attempts, task = pending[4], read(stream, id)
+land(task.job, worker)
+if not wanted(task) then
+  retire(stream, id)
+elseif reason == '' then
+  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'RETRYCOUNT', attempts - 1, 'JUSTID')
+else
+  record_try(stream, id, worker, reason)
+  if verdict(stream, id, task, attempts, worker) == 'park' then
+    park(stream, id, task)
+    return 'parked'
+  end
+  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'JUSTID')
 end
-record_try(stream, id, worker, reason)
-local task = read(stream, id)
-if wanted(task) and verdict(stream, id, task, attempts, worker) == 'park' then
-  park(stream, id, task)
-  return 'parked'
-end
-redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'IDLE', LEASE, 'JUSTID')
 return 'released'

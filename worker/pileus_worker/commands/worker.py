@@ -1,7 +1,6 @@
 """`pileus worker`: one worker, until it is told to stop."""
 
 import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -14,12 +13,15 @@ from pileus_service.roots import Roots
 from pileus_service.store import Store
 from pileus_worker import machine
 from pileus_worker.paths import PathMap
-from pileus_worker.supervisor import Limits, Supervisor
+from pileus_worker.supervisor import Ending, Limits, Supervisor
 
 app = typer.Typer()
 
 # Long enough to hide what a task costs besides, short enough to lose little with a worker.
 TASK_SECONDS = 4.0
+# Shorter than what Docker, Slurm and Kubernetes wait between SIGTERM and SIGKILL.
+GRACE = 8.0
+STALL_SECONDS = 300.0
 
 
 @app.command("worker")
@@ -46,18 +48,34 @@ def worker(
         float, typer.Option(min=0, help="GiB that rendering may take; 0: most of the machine.")
     ] = 0.0,
     task_seconds: Annotated[
-        float, typer.Option(min=0.01, max=600, help="How long a task is planned to take.")
+        float, typer.Option(min=0.001, max=600, help="How long a task is planned to take.")
     ] = TASK_SECONDS,
+    grace: Annotated[
+        float, typer.Option(min=0, help="Seconds that a task may take to finish after SIGTERM.")
+    ] = GRACE,
+    stall_seconds: Annotated[
+        float, typer.Option(min=1, help="How long a task may get nowhere, as when it reads.")
+    ] = STALL_SECONDS,
 ) -> None:
-    """Runs one worker: takes tasks from Redis until it gets SIGTERM or Ctrl-C."""
+    """Runs one worker: takes tasks from Redis until it gets SIGTERM or Ctrl-C.
+
+    After SIGTERM it finishes its task within the grace or hands it back; a second one, or Ctrl-C,
+    makes it hand the task back at once.
+    """
     store = Store(data.resolve())
     logs.configure(FrameLog(store))
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    ending = Ending(grace)
+    signal.signal(signal.SIGTERM, lambda *_: ending.ask())
+    signal.signal(signal.SIGINT, lambda *_: ending.ask(at_once=True))
     allowed = int(memory * (1 << 30)) or machine.memory_bytes()
-    limits = Limits(threads or machine.cores(), machine.cache_bytes(allowed), allowed, task_seconds)
+    limits = Limits(
+        threads or machine.cores(),
+        machine.cache_bytes(allowed),
+        allowed,
+        task_seconds,
+        stall_seconds,
+    )
     queue = Queue(connect(redis))
     roots = Roots(root or [Path.cwd()])
     paths = PathMap.parse(maps or [])
-    Supervisor(queue, store, tuple(roots.folders), limits, paths).run(stop)
+    Supervisor(queue, store, tuple(roots.folders), limits, paths).run(ending)
