@@ -19,11 +19,11 @@ from tenacity import Retrying, retry_if_exception_type, stop_after_delay, wait_f
 
 from pileus_service.client import Client
 from pileus_service.errors import FarmError
-from pileus_service.jobs import JobView, Plan
+from pileus_service.jobs import JobView
 from pileus_service.shot import Shot
 from pileus_service.store import Store
-from pileus_worker import scene
 from pileus_worker.embedded import EmbeddedFarm, embedded_farm
+from serial_render import pixels, plan_of, same_bits
 
 PILEUS = Path(sys.executable).with_name("pileus")
 
@@ -83,57 +83,14 @@ def finish(client: Client, job: str) -> JobView:
     return view
 
 
-def plan_of(tmp_path: Path, job: str, frame: int) -> Plan:
-    plan = Store(tmp_path / "farm").frame(job, frame).plan()
-    assert plan is not None
-    return plan
-
-
-def rendered_here(shot: Shot, plan: Plan) -> core.Frame:
-    """What a farm must write, bit for bit: the plan's parts, rendered one by one."""
-    volume = core.Volume(plan.cache.path, shot.volumes[0].density)
-    view, transport = scene.make_scene(shot, plan.frame, volume), scene.make_transport(shot)
-    samples = shot.sampling.samples
-    buckets = [*dict.fromkeys(part.bucket for part in plan.parts), *plan.empty]
-    size = (shot.image.width, shot.image.height)
-    frame = core.Frame(*size, [(bucket, samples) for bucket in buckets])
-    parts = [(part.bucket, part.samples) for part in plan.parts]
-    parts += [(bucket, (0, samples)) for bucket in plan.empty]
-    for bucket, span in parts:
-        frame.add(
-            core.render(
-                view,
-                transport,
-                bucket=bucket,
-                samples=span,
-                seed=shot.sampling.seed,
-                frame=plan.frame,
-            )
-        )
-    return frame
-
-
-def pixels(path: Path) -> dict[str, np.ndarray[Any, np.dtype[np.float32]]]:
-    [channels] = core.read_image(str(path)).values()
-    return dict(channels)
-
-
-def same_bits(shot: Shot, tmp_path: Path, job: str, frame: int) -> None:
-    here = rendered_here(shot, plan_of(tmp_path, job, frame))
-    expected = tmp_path / f"expected.{frame}.exr"
-    here.write(str(expected), header={})
-    for name, values in pixels(expected).items():
-        np.testing.assert_array_equal(pixels(shot.output(frame))[name], values, name)
-
-
 def test_the_farms_frames_equal_those_of_pileus_render(
     client: Client, real_shot: Shot, tmp_path: Path
 ) -> None:
     job = client.submit(real_shot).job.id
     view = finish(client, job)
     assert view.frames_done == 3
-    assert len({part.bucket for part in plan_of(tmp_path, job, 2).parts}) > 1
-    assert any(part.samples[0] > 0 for part in plan_of(tmp_path, job, 2).parts)
+    assert len({part.bucket for part in plan_of(tmp_path / "farm", job, 2).parts}) > 1
+    assert any(part.samples[0] > 0 for part in plan_of(tmp_path / "farm", job, 2).parts)
     file = tmp_path / "shot.json"
     file.write_text(real_shot.model_dump_json())
     command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
@@ -141,7 +98,7 @@ def test_the_farms_frames_equal_those_of_pileus_render(
     reports = json.loads(ended.stdout)["frames"]
     assert [report["frame"] for report in reports] == [1, 2, 3]
     for report in reports:
-        same_bits(real_shot, tmp_path, job, report["frame"])
+        same_bits(real_shot, tmp_path / "farm", job, report["frame"], tmp_path)
         farm = pixels(real_shot.output(report["frame"]))
         for name, values in pixels(Path(report["file"])).items():
             np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
@@ -164,7 +121,7 @@ def test_killed_workers_change_no_bit(
             killed.add(victim)
         time.sleep(0.1)
     finish(client, job)
-    same_bits(long_shot, tmp_path, job, 1)
+    same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
 @pytest.mark.parametrize("loss", ["emptied", "killed"])
@@ -194,7 +151,7 @@ def test_a_lost_redis_loses_nothing_and_renders_nothing_twice(
                 kept[path] = True
     assert client.job(job).state == "done"
     assert any(kept.values())
-    same_bits(long_shot, tmp_path, job, 1)
+    same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
 def test_a_damaged_partial_is_rendered_again(
@@ -212,7 +169,7 @@ def test_a_damaged_partial_is_rendered_again(
     files[0].write_bytes(data)
     client.control(job, "resume")
     finish(client, job)
-    same_bits(long_shot, tmp_path, job, 1)
+    same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
 def test_a_cancelled_render_stops_within_two_seconds(client: Client, real_shot: Shot) -> None:

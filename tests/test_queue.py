@@ -8,10 +8,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis import Redis
 
-from pileus_service.jobs import Kind, Merged, Planned, Rendered, Task, Wish, WorkerInfo
+from pileus_service.jobs import (
+    Kind,
+    Merged,
+    Planned,
+    Rendered,
+    Stale,
+    Task,
+    Waiting,
+    Wish,
+    WorkerInfo,
+)
 from pileus_service.queue import Queue
 
-LEASE = 0.25
+LEASE = 2.0
 
 
 def worker(name: str) -> WorkerInfo:
@@ -56,8 +66,17 @@ def view(queue: Queue, job: str = "job") -> tuple[str, int, int]:
     return seen.state, seen.frames_done, seen.frames_failed
 
 
-def lapse() -> None:
-    time.sleep(LEASE * 1.2)
+def lapse(queue: Queue) -> None:
+    """All leases run out, as if nothing had been heard of any worker for their time."""
+    for priority in queue.depths():
+        stream = f"pileus:tasks:{priority}"
+        for held in queue.redis.xpending_range(stream, "workers", "-", "+", 100):
+            owner, entry = held["consumer"], held["message_id"]
+            old = int(LEASE * 1000) + 1
+            queue.redis.execute_command(  # type: ignore[no-untyped-call]
+                *("XCLAIM", stream, "workers", owner, 0, entry, "IDLE", old, "JUSTID")
+            )
+    queue.redis.delete("pileus:alive", "pileus:clock")
 
 
 def test_a_job_goes_from_plan_to_done(queue: Queue) -> None:
@@ -79,24 +98,24 @@ def test_an_expired_lease_goes_to_another_and_the_thawed_worker_cannot_take_it_b
     submit(queue)
     frozen = take(queue, A)
     assert queue.claim(B) is None
-    lapse()
+    lapse(queue)
     again = take(queue, B)
     assert (again.entry, again.attempt) == (frozen.entry, 2)
-    assert not queue.renew(frozen, A)
+    assert queue.renew(frozen, A) == "lost"
     assert not do(queue, frozen, A)
     assert queue.fail(frozen, "A", "late") == "lost"
-    assert queue.renew(again, B)
+    assert queue.renew(again, B) == "held"
     assert do(queue, again, B)
 
 
 def test_renewal_keeps_the_lease_and_the_attempt_count(queue: Queue) -> None:
     submit(queue)
     task = take(queue, A)
-    for _ in range(5):
+    for _ in range(3):
         time.sleep(LEASE / 2)
-        assert queue.renew(task, A)
+        assert queue.renew(task, A) == "held"
         assert queue.claim(B) is None
-    lapse()
+    lapse(queue)
     assert take(queue, B).attempt == 2
 
 
@@ -139,7 +158,7 @@ def test_a_worker_lost_three_times_over_parks_the_task_too(queue: Queue) -> None
     submit(queue)
     for info in (A, B, C):
         take(queue, info)
-        lapse()
+        lapse(queue)
     assert queue.claim(D) is None
     reason = queue.failed("job")[0]
     assert reason == "plan failed: A: stopped answering; B: stopped answering; C: stopped answering"
@@ -191,7 +210,7 @@ def test_completion_counts_once_however_often_a_task_was_done(queue: Queue) -> N
     submit(queue)
     do(queue, take(queue), tasks=2)
     first = take(queue, A)
-    lapse()
+    lapse(queue)
     second = take(queue, B)
     assert do(queue, second, B)
     assert not do(queue, first, A)
@@ -287,7 +306,132 @@ def test_whatever_happens_every_frame_ends_and_nothing_is_left(
     assert queue.claim(D) is None
     assert all(depth == (0, 0) for depth in queue.depths().values())
     for job in ("one", "two"):
-        assert redis.hget(f"pileus:job:{job}", "out") == "0"
         seen = queue.job(job)
         assert seen is not None
         assert seen.frames_done + seen.frames_failed == seen.frames
+
+
+def test_equal_jobs_take_turns_and_none_waits_for_another_to_end(queue: Queue) -> None:
+    for job in "abcde":
+        submit(queue, job, frames=50)
+    turns = []
+    for _ in range(200):
+        task = take(queue)
+        turns.append(task.job)
+        do(queue, task, tasks=5)
+    shares = [turns.count(job) for job in "abcde"]
+    assert max(shares) - min(shares) <= 7, "more than a frame's tasks apart"
+    submit(queue, "late", frames=1)
+    # The window of those that wait already, and one turn of each: then it has its first.
+    assert "late" in [take(queue).job for _ in range(8 + 5 + 1)]
+
+
+def test_what_waits_in_redis_does_not_grow_with_the_jobs(queue: Queue) -> None:
+    for number in range(50):
+        submit(queue, f"job{number}", frames=1000)
+    assert queue.depths()[5] == (8, 0)
+
+
+def test_a_worker_whose_tasks_go_well_elsewhere_is_set_aside(queue: Queue) -> None:
+    submit(queue, frames=8)
+    for name in "ABC":
+        queue.hand_back(take(queue, worker(name)), name)
+    for _ in range(3):
+        failed = take(queue, A)
+        assert queue.fail(failed, "A", "no such folder") == "released"
+        again = take(queue, B)
+        assert again.entry == failed.entry
+        do(queue, again, B, tasks=0)
+    assert queue.claim(A) is None
+    [told] = [view.aside for view in queue.workers() if view.name == "A"]
+    assert told is not None
+    assert "no such folder" in told
+    task = take(queue, B)
+    queue.fail(task, "B", "bad")
+    assert take(queue, C).entry == task.entry
+    queue.fail(task, "C", "bad")
+    assert take(queue, B).entry == task.entry, "nobody waits for the one set aside"
+    queue.undrain("A")
+    assert take(queue, A)
+
+
+def test_a_bad_job_sets_no_worker_aside(queue: Queue) -> None:
+    submit(queue, frames=20)
+    names = "ABC"
+    while view(queue)[0] in ("queued", "running"):
+        for name in names:
+            if task := queue.claim(worker(name)):
+                queue.fail(task, name, "bad cache")
+    assert view(queue) == ("failed", 0, 20)
+    assert all(seen.aside is None for seen in queue.workers())
+
+
+def test_a_drained_worker_gets_nothing_until_it_is_told_otherwise(queue: Queue) -> None:
+    submit(queue)
+    take(queue, A)
+    queue.drain("A")
+    queue.drain("B")
+    lapse(queue)
+    assert queue.claim(A) is None
+    assert queue.claim(B) is None
+    queue.undrain("B")
+    assert take(queue, B).attempt == 2
+
+
+def test_a_retry_takes_the_failed_frames_only(queue: Queue) -> None:
+    submit(queue, frames=3)
+    while task := queue.claim(A):
+        if task.frame == 1:
+            queue.fail(task, "A", "no disk")
+        else:
+            do(queue, task)
+    assert view(queue) == ("failed", 2, 1)
+    assert queue.control("job", "retry", 1) == "running"
+    frames = set()
+    while task := queue.claim(A):
+        frames.add(task.frame)
+        do(queue, task)
+    assert frames == {1}
+    assert view(queue) == ("done", 3, 0)
+    assert queue.standings()["job"] == ("done", 5, 1)
+
+
+def test_a_retry_while_the_job_runs_begins_no_frame_twice(queue: Queue) -> None:
+    submit(queue, frames=6)
+    running = take(queue)
+    while not queue.failed("job"):
+        queue.fail(take(queue), "A", "bad")
+    queue.control("job", "retry", 1)
+    do(queue, running)
+    while task := queue.claim(A):
+        do(queue, task)
+    assert view(queue) == ("done", 6, 0)
+
+
+def test_a_frame_waits_for_its_cache_while_others_go_on(queue: Queue, redis: Redis) -> None:
+    submit(queue, frames=2)
+    first = take(queue)
+    assert queue.complete(first, "A", Waiting(wait="not there yet"))
+    while task := queue.claim(A):
+        assert task.frame == 1
+        do(queue, task)
+    assert queue.waiting("job") == {0: "not there yet"}
+    assert view(queue) == ("running", 1, 0)
+    redis.zadd("pileus:due", {"job 0": 0})  # as if its time had come
+    redis.delete("pileus:clock")
+    assert take(queue).frame == 0
+
+
+def test_a_stale_plan_is_made_anew_a_bounded_number_of_times(queue: Queue) -> None:
+    submit(queue)
+    for _ in range(4):
+        do(queue, take(queue), tasks=2)
+        assert queue.complete(take(queue), "A", Stale(stale="cloud.vdb changes"))
+    assert queue.failed("job") == {0: "render failed: cloud.vdb changes"}
+
+
+def test_unwanted_work_is_known_at_renewal(queue: Queue) -> None:
+    submit(queue)
+    task = take(queue)
+    queue.control("job", "cancel")
+    assert queue.renew(task, A) == "unwanted"

@@ -272,7 +272,7 @@ def test_a_task_whose_files_are_swapped_after_its_check_reads_and_writes_none_ou
 
     def run(kind: Kind, part: int = 0) -> Any:
         return Work(farm.store, roots, Caches(1 << 30, reading=roots.reading), 1, 1.0,
-                    job, 1, kind, part, NOWHERE_ELSE).run()  # fmt: skip
+                    job, 1, kind, part, NOWHERE_ELSE, lambda: None, False).run()  # fmt: skip
 
     check = Roots.check
 

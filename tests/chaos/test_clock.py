@@ -1,0 +1,81 @@
+"""Leases rest on Redis's clock alone; and that clock may jump."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from redis import Redis
+
+from pileus_service.jobs import Kind, Planned, Rendered, Wish, WorkerInfo
+from pileus_service.queue import Queue, connect
+from pileus_worker.private_redis import PrivateRedis
+
+LEASE = 1.0
+A, B = (WorkerInfo(name=name, host="host", pid=1, threads=1, started=0.0) for name in "AB")
+
+
+class Clock:
+    """The wall clock of Redis, in seconds beside the true one."""
+
+    def __init__(self, file: Path, redis: Redis) -> None:
+        self._file = file
+        self.redis = redis
+        self.jump(0)
+
+    def jump(self, offset: float) -> None:
+        self._file.write_text(str(offset))
+        assert abs(self.redis.time()[0] - time.time() - offset) < 2
+
+
+@pytest.fixture
+def clock(tmp_path: Path, faults: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
+    monkeypatch.setenv("LD_PRELOAD", str(faults))
+    monkeypatch.setenv("CLOCK_OFFSET", str(tmp_path / "offset"))
+    with PrivateRedis(tmp_path / "redis") as server:
+        monkeypatch.delenv("LD_PRELOAD")
+        with connect(server.url) as redis:
+            yield Clock(tmp_path / "offset", redis)
+
+
+@pytest.fixture
+def queue(clock: Clock) -> Queue:
+    queue = Queue(clock.redis, lease=LEASE)
+    queue.submit("job", "job", time.time(), 1, Wish())
+    return queue
+
+
+def test_a_clock_set_back_makes_no_lease_last_longer(queue: Queue, clock: Clock) -> None:
+    lost = queue.claim(A)
+    assert lost is not None
+    assert queue.claim(B) is None
+    clock.jump(-3600)
+    assert queue.claim(B) is None, "A may live, and has a lease more"
+    end = time.monotonic() + 3 * LEASE
+    while (again := queue.claim(B)) is None:
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert again.entry == lost.entry
+    assert queue.complete(again, "B", Planned(tasks=1, finished=[], total=1, samples=0))
+    alive = {worker.name for worker in queue.workers() if worker.alive}
+    assert alive == {"B"}
+
+
+def test_a_clock_set_forward_takes_tasks_from_the_living_and_no_result(
+    queue: Queue, clock: Clock
+) -> None:
+    planned = queue.claim(A)
+    assert planned is not None
+    assert queue.complete(planned, "A", Planned(tasks=1, finished=[], total=1, samples=0))
+    task = queue.claim(A)
+    assert task is not None
+    clock.jump(3600)
+    again = queue.claim(B)
+    assert again is not None
+    assert again.entry == task.entry
+    assert queue.renew(task, A) == "lost"
+    assert not queue.complete(task, "A", Rendered(samples=1))
+    assert queue.complete(again, "B", Rendered(samples=1))
+    merge = queue.claim(A)
+    assert merge is not None
+    assert merge.kind is Kind.MERGE

@@ -1,0 +1,275 @@
+"""Each fault that the farm survives, brought about for real; see docs/reliability.md."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from chaos.farm import Farm, frozen, until
+from chaos.run import chaos
+from pileus_service.jobs import JobView
+from pileus_service.shot import Shot
+from serial_render import same_bits
+
+
+def ended(farm: Farm, job: str) -> JobView:
+    *_, view = farm.client.watch(job)
+    print(view.model_dump_json(exclude_none=True))  # shown where a test fails
+    return view
+
+
+def longer(shot: Shot, samples: int, frames: str = "1") -> Shot:
+    sampling = shot.sampling.model_copy(update={"samples": samples})
+    return shot.model_copy(update={"frames": frames, "sampling": sampling})
+
+
+def with_cache(shot: Shot, cache: Path) -> Shot:
+    volume = shot.volumes[0].model_copy(update={"cache": str(cache)})
+    return shot.model_copy(update={"volumes": (volume,)})
+
+
+def parts(farm: Farm, job: str) -> dict[Path, int]:
+    """The partials on disk, with the time each was written."""
+    found = {}
+    for path in (farm.data / "jobs" / job).glob("frames/*/parts/*.exr"):
+        with contextlib.suppress(FileNotFoundError):
+            found[path] = path.stat().st_mtime_ns
+    return found
+
+
+def busy(farm: Farm) -> list[int]:
+    """The pids of workers that have a task."""
+    return [worker.pid for worker in farm.queue.workers() if worker.alive and worker.task]
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"tasks": 250, "workers": 3, "frames": 1, "kill_every": 1.5},
+        pytest.param(
+            {"tasks": 100_000, "workers": 10, "frames": 20, "kill_every": 2.0},
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["small", "full"],
+)
+def test_frames_are_right_whatever_is_killed(size: dict[str, int], tmp_path: Path) -> None:
+    figures = chaos(tmp_path, seed=1, **size)
+    print(figures)
+    assert figures["left_over"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True], ids=["supervisor", "supervisor and child"])
+def test_a_thawed_worker_changes_nothing(cached_shot: Shot, tmp_path: Path, whole: bool) -> None:
+    shot = longer(cached_shot, 3000)
+    with Farm(tmp_path, [tmp_path], 2, task_seconds=3) as farm:
+        job = farm.client.submit(shot).job.id
+        until(lambda: len(busy(farm)) == 2)
+        victim = next(w for w in farm.workers if w.pid in busy(farm))
+        with frozen(victim.pid, *(victim.children if whole else [])):
+            assert ended(farm, job).state == "done"
+            image = shot.output(1).read_bytes()
+            assert farm.queue.stats()["leases_lost"] >= 1
+        time.sleep(5)
+        assert shot.output(1).read_bytes() == image
+        assert farm.leftovers() == []
+        same_bits(shot, farm.data, job, 1, tmp_path)
+
+
+def test_a_redis_of_an_earlier_hour_is_put_right(cached_shot: Shot, tmp_path: Path) -> None:
+    with Farm(tmp_path, [tmp_path], 2) as farm:
+        early = farm.client.submit(cached_shot).job.id
+        late = farm.client.submit(longer(cached_shot, 300)).job.id
+        gone = farm.client.submit(longer(cached_shot, 1 << 18)).job.id
+        dropped = farm.client.submit(longer(cached_shot, 1 << 18)).job.id
+        farm.client.control(late, "pause")
+        snapshot = tmp_path / "snapshot"
+        until(lambda: farm.queue.redis.info("persistence")["aof_rewrite_in_progress"] == 0)
+        shutil.copytree(tmp_path / "redis", snapshot)
+        farm.client.control(gone, "cancel")
+        httpx.delete(f"http://{farm.listen}/v1/jobs/{dropped}").raise_for_status()
+        farm.client.control(late, "resume")
+        assert ended(farm, early).state == "done"
+        until(lambda: len(parts(farm, late)) > 3)
+        farm.client.control(late, "pause")
+        until(lambda: not busy(farm))
+        written = {path: path.stat().st_mtime_ns for path in tmp_path.glob("out/*.exr")}
+        before = parts(farm, late)
+        with frozen(farm.service.pid):
+            os.kill(farm.redis.pid, signal.SIGSTOP)
+            shutil.rmtree(tmp_path / "redis")
+            shutil.copytree(snapshot, tmp_path / "redis")
+            os.kill(farm.redis.pid, signal.SIGKILL)
+        farm.until_served()
+        until(lambda: farm.queue.state(gone) == "cancelled" and farm.queue.state(dropped) is None)
+        kept: set[Path] = set()
+        farm.client.control(late, "resume")
+        for _ in farm.client.watch(late):
+            now = parts(farm, late)
+            kept |= before.keys() & now.keys()
+            assert all(now[path] == before[path] for path in before.keys() & now.keys())
+        assert kept
+        assert ended(farm, early).state == "done"
+        for path, time_written in written.items():
+            if path != cached_shot.output(1):  # `late` writes its frame there, too
+                assert path.stat().st_mtime_ns == time_written
+        same_bits(longer(cached_shot, 300), farm.data, late, 1, tmp_path)
+
+
+def test_a_killed_service_is_back_within_five_seconds(cached_shot: Shot, tmp_path: Path) -> None:
+    with Farm(tmp_path, [tmp_path], 1) as farm:
+        job = farm.client.submit(longer(cached_shot, 200)).job.id
+        os.kill(farm.service.pid, signal.SIGKILL)
+        until(lambda: farm.service.process.poll() is None)
+        print(f"the service was away for {farm.until_served():.1f} s")
+        assert ended(farm, job).state == "done"
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[None]:
+    """A file system of its own, if this machine lets us mount one."""
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("no right to mount a file system")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("trouble", ["full", "read-only"])
+def test_a_disk_that_is_mended_takes_the_frames_it_refused(
+    cached_shot: Shot, tmp_path: Path, trouble: str
+) -> None:
+    out = tmp_path / "out"
+    with small_disk(out, "400k"), Farm(tmp_path, [tmp_path], 2) as farm:
+        job = farm.client.submit(cached_shot).job.id
+        if trouble == "full":
+            (out / "ballast").write_bytes(b"x" * (360 << 10))
+        else:
+            subprocess.run(["mount", "-o", "remount,ro", str(out)], check=True)
+        view = ended(farm, job)
+        assert view.state == "failed"
+        assert ("No space left" if trouble == "full" else "Read-only") in (view.reason or "")
+        assert all(worker.aside is None for worker in farm.queue.workers())
+        kept = parts(farm, job)
+        if trouble == "full":
+            (out / "ballast").unlink()
+        else:
+            subprocess.run(["mount", "-o", "remount,rw", str(out)], check=True)
+        assert not list(out.rglob("*.exr"))
+        farm.client.control(job, "retry")
+        assert ended(farm, job).state == "done"
+        for frame in (1, 2, 3):
+            same_bits(cached_shot, farm.data, job, frame, tmp_path)
+        assert kept
+        assert farm.leftovers() == []
+        assert not list(out.glob(".*"))
+
+
+def test_a_full_data_folder_holds_the_farm_until_there_is_room(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    with small_disk(tmp_path / "farm", "8m"), Farm(tmp_path / "farm", [tmp_path], 2) as farm:
+        job = farm.client.submit(longer(cached_shot, 100, "1-3")).job.id
+        until(lambda: bool(parts(farm, job)))
+        ballast = tmp_path / "farm" / "ballast"
+        with contextlib.suppress(OSError), ballast.open("wb") as file:
+            while True:
+                file.write(b"x" * 4096)
+        time.sleep(5)
+        ballast.unlink()
+        until(lambda: farm.until_served() >= 0 and farm.client.job(job).state in ("failed", "done"))
+        if farm.client.job(job).state == "failed":
+            assert "No space left" in (farm.client.job(job).reason or "")
+            farm.client.control(job, "retry")
+        assert ended(farm, job).state == "done"
+        for frame in (1, 2, 3):
+            same_bits(longer(cached_shot, 100, "1-3"), farm.data, job, frame, tmp_path)
+        assert farm.leftovers() == []
+
+
+def test_caches_in_the_making_are_waited_for_and_only_failed_frames_retried(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    caches = tmp_path / "caches"
+    whole = {n: (caches / f"cloud.{n:04d}.vdb").read_bytes() for n in (1, 2, 3)}
+    (caches / "cloud.0001.vdb").unlink()
+    (caches / "cloud.0002.vdb").write_bytes(whole[2][:2000])
+    with Farm(tmp_path, [tmp_path], 2) as farm:
+        waits = farm.client.submit(cached_shot, wait_for_caches=True).job.id
+        with pytest.raises(ValueError, match="gap"):
+            farm.client.submit(cached_shot)
+        until(lambda: farm.client.job(waits).frames_done == 1)
+        reasons = {frame.frame: frame.reason or "" for frame in farm.client.frames(waits)}
+        assert "not there yet" in reasons[1]
+        for size in range(3000, len(whole[2]), len(whole[2]) // 5):  # as a simulation writes
+            (caches / "cloud.0002.vdb").write_bytes(whole[2][:size])
+            time.sleep(1)
+        for frame in (1, 2):
+            (caches / f"cloud.{frame:04d}.vdb").write_bytes(whole[frame])
+        assert ended(farm, waits).state == "done"
+        for frame in (1, 2, 3):
+            same_bits(cached_shot, farm.data, waits, frame, tmp_path)
+            cached_shot.output(frame).unlink()
+
+        (caches / "cloud.0002.vdb").write_bytes(whole[2][:2000])
+        cut = farm.client.submit(cached_shot).job.id
+        view = ended(farm, cut)
+        assert (view.state, view.frames_done, view.frames_failed) == ("failed", 2, 1)
+        assert "frame 2: plan failed" in (view.reason or "")
+        untouched = {n: cached_shot.output(n).stat().st_mtime_ns for n in (1, 3)}
+        (caches / "cloud.0002.vdb").write_bytes(whole[2])
+        farm.client.control(cut, "retry")
+        assert ended(farm, cut).state == "done"
+        assert untouched == {n: cached_shot.output(n).stat().st_mtime_ns for n in (1, 3)}
+        same_bits(cached_shot, farm.data, cut, 2, tmp_path)
+
+
+def test_a_cache_that_changes_while_it_renders_gives_no_frame_of_two_caches(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    shot = longer(cached_shot, 300)
+    one, other = (tmp_path / "caches" / f"cloud.{n:04d}.vdb" for n in (1, 3))
+    with Farm(tmp_path, [tmp_path], 2) as farm:
+        job = farm.client.submit(shot).job.id
+        until(lambda: len(parts(farm, job)) > 3)
+        one.write_bytes(other.read_bytes())
+        assert ended(farm, job).state == "done"
+        same_bits(shot, farm.data, job, 1, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("crash", "died of signal 11"),
+        ("eat", "of memory|signal 6"),
+        pytest.param("hang", "got nowhere", marks=pytest.mark.slow),
+    ],
+)
+def test_a_cache_that_ruins_its_reader_costs_its_frame_and_no_worker(
+    cached_shot: Shot, tmp_path: Path, faults: Path, fault: str, reason: str
+) -> None:
+    """Frame 2 does it, also while it is read ahead for frame 1."""
+    options = ("--memory=0.5", "--stall-seconds=10")
+    env = {"LD_PRELOAD": str(faults), "FAULT": fault, "FAULT_FILE": "cloud.0002.vdb"}
+    with Farm(tmp_path / "farm", [tmp_path], 3, options=options, env=env) as farm:
+        farm.until_workers(3)
+        pids = {part.pid for part in farm.workers}
+        job = farm.client.submit(cached_shot).job.id
+        view = ended(farm, job)
+        assert (view.state, view.frames_done, view.frames_failed) == ("failed", 2, 1)
+        [told] = [frame.reason or "" for frame in farm.client.frames(job) if frame.frame == 2]
+        assert len(re.findall(reason, told)) == 3, "each of three workers tried"
+        assert pids == {part.pid for part in farm.workers}
+        assert all(worker.aside is None for worker in farm.queue.workers())
