@@ -23,7 +23,7 @@ if [ -n "$$missing" ]; then \
 fi
 endef
 
-.PHONY: demo test test-slow lint setup clean
+.PHONY: demo test test-slow chart chart-small peers lint setup clean
 
 demo: setup
 	$(PYTHON) -m pileus_worker.demo
@@ -36,9 +36,27 @@ test-slow: lint build/.built $(VENV)/.slow
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest -m ''
 
+# About an hour; writes the page. Real caches are taken from ../shared/data, where there are any.
+chart: setup peers
+	$(PIP) --editable '.[bench]'
+	$(VENV)/bin/pileus chart --full --peers --out chart --page docs/speed-and-accuracy.md
+
+chart-small: setup peers
+	$(PIP) --editable '.[bench]'
+	$(VENV)/bin/pileus chart --peers --out chart
+
+# In an environment of their own: they need other versions of what Pileus uses.
+peers: $(VENV)/peers/.installed
+
+$(VENV)/peers/.installed: pyproject.toml $(VENV)/.venv
+	$(call install,libllvm19)
+	python3 -m venv $(VENV)/peers
+	$(VENV)/peers/bin/pip install --quiet --disable-pip-version-check '.[peers]'
+	@touch $@
+
 lint: setup
-	$(VENV)/bin/ruff check service worker tests
-	$(VENV)/bin/ruff format --check service worker tests
+	$(VENV)/bin/ruff check service worker bench tests
+	$(VENV)/bin/ruff format --check service worker bench tests
 	$(VENV)/bin/mypy
 	find core -name '*.cpp' -o -name '*.h' | xargs clang-format --dry-run --Werror
 
@@ -70,4 +88,4 @@ build/.built: $(CORE) $(VENV)/.system
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build demo
+	rm -rf $(VENV) build demo chart chart-data

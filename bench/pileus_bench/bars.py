@@ -1,0 +1,65 @@
+"""The bars: what a chart's points say of the ratios that Pileus sets out to reach."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+from pileus_bench.results import Bar, Point
+
+
+def bars_of(points: Sequence[Point]) -> list[Bar]:
+    return [
+        _reference(points, "core seconds", lambda p: p.cpu_efficiency),
+        _reference(points, "wall seconds", lambda p: p.efficiency),
+        _multiple(points),
+    ]
+
+
+def geometric_mean(values: Iterable[float]) -> float | None:
+    logs = [math.log(value) for value in values]
+    return math.exp(sum(logs) / len(logs)) if logs else None
+
+
+def efficiency(
+    points: Sequence[Point], scene: str, contender: str, of: Callable[[Point], float]
+) -> float | None:
+    """Over a contender's budgets on a scene: those of an unbiased one differ by chance alone."""
+    return geometric_mean(of(p) for p in points if (p.scene, p.contender) == (scene, contender))
+
+
+def _reference(points: Sequence[Point], unit: str, of: Callable[[Point], float]) -> Bar:
+    """`reference` against the better peer, neither denoised, by 1 / (relMSE x seconds)."""
+    ratios = {}
+    rivals = dict.fromkeys(p.contender for p in points if p.peer and not p.denoised)
+    for scene in dict.fromkeys(p.scene for p in points):
+        ours = efficiency(points, scene, "reference", of)
+        theirs = [e for name in rivals if (e := efficiency(points, scene, name, of)) is not None]
+        if ours is not None and theirs:
+            ratios[scene] = ours / max(theirs)
+    return Bar(
+        what=f"reference against the better peer, 1 / (relMSE x {unit})",
+        wanted="20 on the mean, 8 on the worst scene",
+        values=ratios,
+        mean=geometric_mean(ratios.values()),
+    )
+
+
+def _multiple(points: Sequence[Point]) -> Bar:
+    """Core seconds to equal noise, each method's noise relative to its own mean image."""
+    ratios = {}
+    for scene in dict.fromkeys(p.scene for p in points):
+        cost = {
+            name: geometric_mean(
+                p.own_noise * p.cpu_seconds
+                for p in points
+                if (p.scene, p.contender) == (scene, name)
+            )
+            for name in ("multiple", "single")
+        }
+        if cost["multiple"] is not None and cost["single"] is not None:
+            ratios[scene] = cost["multiple"] / cost["single"]
+    return Bar(
+        what="multiple at 16 orders against single, time at equal noise",
+        wanted="at most 4",
+        values=ratios,
+        mean=geometric_mean(ratios.values()),
+    )

@@ -1,0 +1,101 @@
+"""The chart: bias and noise are told apart, and a scene's points come out as they must."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pileus_bench.contenders import PEERS, methods
+from pileus_bench.measures import Truth, errors
+from pileus_bench.run import Measurement, Plan
+from pileus_bench.scenes import AbsentError, load_scene, scene_names
+from pileus_service.shotfile import load_shot
+
+TINY = Plan(budgets=(0.05,), repeats=3, truth_noise=1e-4, truth_seconds=2.0, scale=0.25)
+
+
+@pytest.mark.parametrize(("bias", "noise", "truth_noise"), [(0.05, 0.1, 0.02), (0.0, 0.2, 0.05)])
+def test_bias_and_noise_are_told_apart_whatever_the_truths_own_noise(
+    bias: float, noise: float, truth_noise: float
+) -> None:
+    """Made images around a known one: the estimates must find what was put in."""
+    random = np.random.default_rng(7)
+    exact = random.uniform(0.5, 1.5, (160, 240, 1)).repeat(3, axis=2)
+
+    def seen(spread: float, factor: float = 1.0) -> np.ndarray:
+        return exact * factor * (1 + spread * random.standard_normal(exact.shape))
+
+    truth = Truth(seen(truth_noise), seen(truth_noise))
+    found = errors([([seen(noise, 1 + bias) for _ in range(4)], truth)])
+    relative = np.mean(exact**2 / (exact**2 + 0.01))
+    assert found.noise == pytest.approx(((1 + bias) * noise) ** 2 * relative, rel=0.05)
+    assert found.bias.value == pytest.approx(bias**2 * relative, abs=1e-4)
+    assert found.rel_mse.value == pytest.approx(found.noise + found.bias.value, rel=0.05)
+    assert (found.bias.low > 0) == (bias > 0)
+    assert found.mean_ratio == pytest.approx(1 + bias, abs=4 * found.mean_ratio_error)
+
+
+def test_a_few_fireflies_do_not_decide() -> None:
+    random = np.random.default_rng(8)
+    exact = np.ones((100, 100, 3))
+    truth = Truth(exact, exact)
+    renders = [exact + 0.1 * random.standard_normal(exact.shape) for _ in range(3)]
+    calm = errors([(renders, truth)])
+    for render in renders:
+        render[random.integers(100, size=9), random.integers(100, size=9)] = 1e4
+    wild = errors([(renders, truth)])
+    assert wild.rel_mse.value > 1000
+    assert wild.trimmed.value == pytest.approx(calm.trimmed.value, rel=0.02)
+
+
+def test_every_scene_is_a_shot(tmp_path: Path) -> None:
+    import pileus_bench.scenes as module
+
+    assert len(scene_names()) >= 10
+    animated = 0
+    for name in scene_names():
+        shot = load_shot(module.SCENES / f"{name}.toml")
+        animated += len(shot.frame_numbers) > 1
+    assert animated >= 2
+    with pytest.raises(AbsentError, match="cumulus256"):
+        load_scene("cumulus", 0.25, tmp_path, tmp_path)
+
+
+def test_a_scene_is_measured_and_its_truth_kept(tmp_path: Path) -> None:
+    notes: list[str] = []
+    pythons = {each.renderer: sys.executable for each in PEERS} | {"pileus": sys.executable}
+    with Measurement(TINY, tmp_path, pythons, notes.append) as measurement:
+        wanted = [each for each in methods() if each.name in ("single", "reference")]
+        # This interpreter has no peers: a line each, and the rest goes on.
+        contenders = measurement.start([*wanted, *PEERS])
+        assert contenders == wanted
+        assert len(measurement.skipped) == 2
+        scene = load_scene("smoke", TINY.scale, tmp_path, tmp_path)
+        measurement.scene(scene, contenders)
+        single, reference = measurement.points
+        assert single.bias.low > 0.001, "smoke without its multiple scattering"
+        assert single.mean_ratio < 1 - 4 * single.mean_ratio_error
+        assert reference.bias.low <= 0
+        assert reference.mean_ratio == pytest.approx(1, abs=5 * reference.mean_ratio_error)
+
+        kept = list((tmp_path / "truths").iterdir())
+        assert len(kept) == 1
+        before = kept[0].stat().st_mtime_ns
+        measurement.scene(scene, contenders)
+        assert [file.stat().st_mtime_ns for file in (tmp_path / "truths").iterdir()] == [before]
+
+
+def test_an_unknown_scene_is_one_line(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [
+            str(Path(sys.executable).with_name("pileus")),
+            *("chart", "--scenes", "haze,nothing", "--data", str(tmp_path)),
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert "nothing" in ended.stderr
