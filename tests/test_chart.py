@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pileus_core as core
 import pytest
 
 from pileus_bench.contenders import PEERS, methods
@@ -85,6 +86,22 @@ def test_a_scene_is_measured_and_its_truth_kept(tmp_path: Path) -> None:
         before = kept[0].stat().st_mtime_ns
         measurement.scene(scene, contenders)
         assert [file.stat().st_mtime_ns for file in (tmp_path / "truths").iterdir()] == [before]
+
+
+def test_dense_voxels_are_those_that_are_interpolated(tmp_path: Path) -> None:
+    """What the peers get is the field that Pileus renders, voxel by voxel, and 0 all around."""
+    path = str(tmp_path / "cloud.vdb")
+    core.make_cloud(path, frame=1, frames=1, resolution=24)
+    volume = core.Volume(path)
+    voxels, flat = volume.dense() or pytest.fail("a cloud is not empty")
+    to_world = np.array(flat).reshape(4, 4)
+    random = np.random.default_rng(9)
+    for z, y, x in random.integers(voxels.shape, size=(500, 3)):
+        world = np.array([x, y, z, 1.0]) @ to_world
+        assert volume.interpolate(tuple(world[:3])) == pytest.approx(voxels[z, y, x], abs=1e-3)
+    assert voxels.max() > 0.9
+    inner = voxels[1:-1, 1:-1, 1:-1]
+    assert inner.sum() == pytest.approx(voxels.sum())
 
 
 def test_an_unknown_scene_is_one_line(tmp_path: Path) -> None:

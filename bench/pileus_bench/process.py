@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from pileus_service.errors import FarmError
+
 Image = NDArray[np.float64]
 
 
-class RendererError(Exception):
+class RendererError(FarmError):
     """The renderer cannot be had, has refused or has died; one line says why."""
 
 

@@ -3,9 +3,10 @@
 Taking turns puts whatever else the machine does on all alike, so that ratios survive it.
 """
 
+import json
 import math
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, median
@@ -41,6 +42,9 @@ class _Runs:
     images: list[list[Image]] = field(default_factory=list)
     spent: list[list[Spent]] = field(default_factory=list)
     samples: list[int] = field(default_factory=list)
+
+
+Runs = dict[tuple[Contender, float], _Runs]
 
 
 class Measurement:
@@ -83,14 +87,19 @@ class Measurement:
         return self._processes[renderer]
 
     def scene(self, scene: BenchScene, contenders: Sequence[Contender]) -> None:
-        runs = {(each, budget): _Runs() for each in contenders for budget in self._plan.budgets}
+        runs: Runs = {
+            (each, budget): _Runs() for each in contenders for budget in self._plan.budgets
+        }
         truths = []
         for frame in scene.frames:
             view = view_of(scene, frame, self._data)
             for module, process in self._processes.items():
-                self.starts[module].load[f"{scene.name}.{frame}"] = process.load(view).seconds
+                with self._forgiven(scene, module, runs):
+                    self.starts[module].load[f"{scene.name}.{frame}"] = process.load(view).seconds
             truths.append(self._truth(scene, frame, view))
-            self._frame(runs)
+            self._calibrate(scene, runs)
+            for repeat in range(self._plan.repeats):
+                self._render_each(scene, runs, repeat)
         for (contender, budget), run in runs.items():
             point = _point(scene.name, contender, budget, run, truths)
             self.points.append(point)
@@ -112,24 +121,45 @@ class Measurement:
         self._note(f"{scene.name}.{frame}: truth of 2 x {samples} samples, noise {truth.noise:.2g}")
         return truth
 
-    def _frame(self, runs: dict[tuple[Contender, float], _Runs]) -> None:
-        plan = self._plan
-        for contender in dict.fromkeys(contender for contender, _ in runs):
-            process = self._processes[contender.renderer]
-            _, probe = process.render(contender.settings, PROBE_SAMPLES, 0)
-            per_sample = max(probe.cpu_seconds, 1e-4) / PROBE_SAMPLES
-            for budget in plan.budgets:
-                run = runs[contender, budget]
-                run.images.append([])
-                run.spent.append([])
-                run.samples.append(_samples(budget, per_sample))
-        for repeat in range(plan.repeats):
-            for (contender, _), run in runs.items():
+    def _calibrate(self, scene: BenchScene, runs: Runs) -> None:
+        """Finds how many samples each contender's budgets buy, and begins a frame."""
+        costs: dict[str, float] = {}
+        for contender in list(dict.fromkeys(contender for contender, _ in runs)):
+            with self._forgiven(scene, contender.renderer, runs):
+                # Samples alone: a denoiser's time comes on top of what its budget buys.
+                settings = {**contender.settings, "denoise": False}
+                kind = json.dumps([contender.renderer, settings])
+                if kind not in costs:
+                    process = self._processes[contender.renderer]
+                    _, probe = process.render(settings, PROBE_SAMPLES, 0)
+                    costs[kind] = max(probe.cpu_seconds, 1e-4) / PROBE_SAMPLES
+                for budget in self._plan.budgets:
+                    run = runs[contender, budget]
+                    run.images.append([])
+                    run.spent.append([])
+                    run.samples.append(_samples(budget, costs[kind]))
+
+    def _render_each(self, scene: BenchScene, runs: Runs, repeat: int) -> None:
+        for (contender, _), run in list(runs.items()):
+            with self._forgiven(scene, contender.renderer, runs):
                 image, spent = self._processes[contender.renderer].render(
                     contender.settings, run.samples[-1], 1 + repeat
                 )
                 run.images[-1].append(image)
                 run.spent[-1].append(spent)
+
+    @contextmanager
+    def _forgiven(self, scene: BenchScene, renderer: str, runs: Runs) -> Iterator[None]:
+        """A peer that fails is left out of the scene; Pileus may not fail."""
+        try:
+            yield
+        except RendererError as error:
+            if renderer == "pileus":
+                raise
+            if any(contender.renderer == renderer for contender, _ in runs):
+                self._skip(f"{scene.name}: {error}; skipped")
+            for key in [key for key in runs if key[0].renderer == renderer]:
+                del runs[key]
 
     def _skip(self, line: str) -> None:
         self.skipped.append(line)

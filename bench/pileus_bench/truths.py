@@ -25,7 +25,7 @@ def truth_of(
     The pilot says how many samples reach the noise (a relMSE); no more than fit in the
     core seconds.
     """
-    file = data / "truths" / f"{digest(view, noise)}.npz"
+    file = data / "truths" / f"{digest(view, noise, most_seconds)}.npz"
     if file.is_file():
         held = np.load(file)
         return Truth(held["a"].astype(np.float64), held["b"].astype(np.float64)), int(
@@ -50,12 +50,13 @@ def truth_of(
     return truth, samples
 
 
-def digest(view: dict[str, Any], noise: float) -> str:
+def digest(view: dict[str, Any], noise: float, most_seconds: float) -> str:
     """Of all that a truth depends on: the cache's bytes, the view, the renderer's version."""
     told = {
         "cache": hashlib.sha256(Path(view["cache"]).read_bytes()).hexdigest(),
         "version": core.__version__,
         "noise": noise,
+        "most_seconds": most_seconds,
         **{key: view[key] for key in view if key not in ("shot", "frame", "cache", "voxels")},
     }
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
