@@ -26,6 +26,23 @@ def efficiency(
     return geometric_mean(of(p) for p in points if (p.scene, p.contender) == (scene, contender))
 
 
+def seconds_to(points: Sequence[Point], scene: str, contender: str, target: float) -> float | None:
+    """Core seconds to a relMSE: what the bias leaves of it is the noise's, which falls as 1 / time.
+
+    None where the bias alone is more, or nothing was measured.
+    """
+    found = []
+    for p in points:
+        if (p.scene, p.contender) != (scene, contender):
+            continue
+        bias = max(p.bias.value, 0.0) if p.bias.low > 0 else 0.0
+        if bias >= target:
+            return None
+        noise = max(p.trimmed.value - bias, 1e-12)
+        found.append(p.cpu_seconds * noise / (target - bias))
+    return geometric_mean(found)
+
+
 def _reference(points: Sequence[Point], unit: str, of: Callable[[Point], float]) -> Bar:
     """`reference` against the better peer, neither denoised, by 1 / (relMSE x seconds)."""
     ratios = {}

@@ -12,7 +12,8 @@ import pileus_core as core
 import typer
 
 from pileus_bench.bars import bars_of
-from pileus_bench.contenders import PEERS, methods
+from pileus_bench.contenders import CYCLES_DENOISED, PEERS, methods
+from pileus_bench.end_to_end import denoised_bar, end_to_end
 from pileus_bench.page import write_page
 from pileus_bench.results import Chart
 from pileus_bench.run import Measurement, Plan
@@ -84,6 +85,10 @@ def chart(
             refinement(ours_alone, ours, plan, data),
             threads(ours_alone, ours, plan, data),
         ]
+        denoised = []
+        if peers and CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
+            denoised = end_to_end(ours_alone, peers_python, plan.scale, data, shared)
+            bars.append(denoised_bar(denoised))
         result = Chart(
             kind="full" if full else "small",
             command=shlex.join(["pileus", *sys.argv[1:]]),
@@ -96,6 +101,7 @@ def chart(
             truths=measurement.truths,
             points=measurement.points,
             starts=list(measurement.starts.values()),
+            end_to_end=denoised,
             bars=bars,
             skipped=measurement.skipped,
         )

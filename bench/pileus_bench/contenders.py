@@ -31,10 +31,11 @@ def _cycles(name: str, biased: bool, denoise: bool) -> Contender:
     return Contender(name, "cycles", {"biased": biased, "denoise": denoise}, denoise)
 
 
+CYCLES_DENOISED = _cycles("Cycles + OIDN", biased=False, denoise=True)
 PEERS = [
     Contender("Mitsuba 3", "mitsuba_volpath"),
     _cycles("Cycles", biased=False, denoise=False),
     _cycles("Cycles biased", biased=True, denoise=False),
-    _cycles("Cycles + OIDN", biased=False, denoise=True),
+    CYCLES_DENOISED,
     _cycles("Cycles biased + OIDN", biased=True, denoise=True),
 ]

@@ -80,6 +80,11 @@ def errors(renders: Sequence[tuple[Sequence[Image], Truth]]) -> Errors:
     )
 
 
+def trimmed_error(image: Image, truth: Truth) -> float:
+    """The relMSE of one render without its worst pixels and without the truth's noise."""
+    return float(np.mean(_trim([image], truth)))
+
+
 def relative_noise(images: Sequence[Image]) -> float:
     """The repeats' variance relative to their own mean: what methods of different truths share."""
     stack = np.stack(images)

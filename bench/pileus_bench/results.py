@@ -71,6 +71,17 @@ class Bar(Record):
     mean: float | None = None
 
 
+class EndToEnd(Record):
+    """One render from a cache on disk to an image on disk, denoised."""
+
+    scene: str
+    contender: str
+    samples: int
+    rel_mse: float
+    seconds: float
+    cpu_seconds: float
+
+
 class Chart(Record):
     kind: Literal["small", "full"]
     command: str
@@ -83,5 +94,6 @@ class Chart(Record):
     truths: list[TruthRecord]
     points: list[Point]
     starts: list[Start]
+    end_to_end: list[EndToEnd]
     bars: list[Bar]
     skipped: list[str]
