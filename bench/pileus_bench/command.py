@@ -83,7 +83,7 @@ def chart(
         bars = [
             *bars_of(measurement.points),
             refinement(ours_alone, ours, plan, data),
-            threads(ours_alone, ours, plan, data),
+            *threads(ours_alone, ours, plan, data),
         ]
         denoised = []
         if peers and CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
@@ -102,7 +102,7 @@ def chart(
             points=measurement.points,
             starts=list(measurement.starts.values()),
             end_to_end=denoised,
-            bars=bars,
+            bars=[bar for bar in bars if bar.values],
             skipped=measurement.skipped,
         )
     if out is not None:
