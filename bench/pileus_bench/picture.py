@@ -57,7 +57,7 @@ def _panel(
     panel.set_title(scene, fontsize=10)
     panel.set_xlabel("core seconds", fontsize=8)
     panel.set_ylabel("relMSE", fontsize=8)
-    panel.tick_params(labelsize=7)
+    panel.tick_params(which="both", labelsize=7)
     panel.grid(alpha=0.2, which="both")
     ours = front([point for point in points if not point.peer])
     panel.plot(
