@@ -88,4 +88,4 @@ build/.built: $(CORE) $(VENV)/.system
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build demo chart chart-data
+	rm -rf $(VENV) build demo chart

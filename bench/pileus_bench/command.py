@@ -40,8 +40,9 @@ def chart(
         str | None, typer.Option("--methods", metavar="A,B", help="Only these of our methods.")
     ] = None,
     data: Annotated[
-        Path, typer.Option(metavar="DIR", help="Keeps made caches and truths here.")
-    ] = Path("chart-data"),
+        Path | None,
+        typer.Option(metavar="DIR", help="Keeps made caches and truths here, not in ~/.cache."),
+    ] = None,
     shared: Annotated[
         Path, typer.Option(metavar="DIR", help="Real caches, where there are any.")
     ] = Path("../shared/data"),
@@ -60,7 +61,7 @@ def chart(
     """Charts error against time: scenes x methods x budgets."""
     _check_outputs(out, page)
     plan = FULL if full else SMALL
-    data = data.resolve()
+    data = (data or _cache_folder()).resolve()
     chosen = _chosen(scenes, scene_names(), "--scenes")
     names = _chosen(only, list(core.METHODS), "--methods")
     ours = [each for each in methods() if each.name in names]
@@ -145,6 +146,10 @@ def _chosen(asked: str | None, known: list[str], option: str) -> list[str]:
         if name not in known:
             raise InputError(f"{option} {name}: not known; choose from {', '.join(known)}")
     return names
+
+
+def _cache_folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "pileus" / "chart"
 
 
 def _peers_python() -> Path:
