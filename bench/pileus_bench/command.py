@@ -4,6 +4,7 @@ import os
 import shlex
 import shutil
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from pileus_bench.bars import bars_of
 from pileus_bench.contenders import CYCLES_DENOISED, PEERS, methods
 from pileus_bench.end_to_end import denoised_bar, end_to_end
 from pileus_bench.page import write_page
-from pileus_bench.results import Chart
+from pileus_bench.results import Bar, Chart, EndToEnd
 from pileus_bench.run import Measurement, Plan
 from pileus_bench.scaling import refinement, threads
 from pileus_bench.scenes import AbsentError, load_scene, scene_names
@@ -25,7 +26,7 @@ from pileus_worker.errors import plain_errors
 
 app = typer.Typer()
 
-SMALL = Plan(budgets=(0.3, 1.2), repeats=3, truth_noise=1e-3, truth_seconds=30.0, scale=0.5)
+SMALL = Plan(budgets=(0.2, 0.8), repeats=3, truth_noise=1e-3, truth_seconds=20.0, scale=0.5)
 FULL = Plan(budgets=(0.5, 2.0, 8.0), repeats=3, truth_noise=2e-4, truth_seconds=240.0, scale=1.0)
 
 
@@ -38,6 +39,9 @@ def chart(
     scenes: Annotated[str | None, typer.Option(metavar="A,B", help="Only these scenes.")] = None,
     only: Annotated[
         str | None, typer.Option("--methods", metavar="A,B", help="Only these of our methods.")
+    ] = None,
+    repeats: Annotated[
+        int | None, typer.Option(min=2, help="Renders of each kind, with different seeds.")
     ] = None,
     data: Annotated[
         Path | None,
@@ -61,6 +65,7 @@ def chart(
     """Charts error against time: scenes x methods x budgets."""
     _check_outputs(out, page)
     plan = FULL if full else SMALL
+    plan = replace(plan, repeats=repeats or plan.repeats)
     data = (data or _cache_folder()).resolve()
     chosen = _chosen(scenes, scene_names(), "--scenes")
     names = _chosen(only, list(core.METHODS), "--methods")
@@ -71,26 +76,12 @@ def chart(
     def note(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    with plain_errors("chart"), Measurement(plan, data, pythons, note) as measurement:
-        contenders = measurement.start([*ours, *(PEERS if peers else [])])
-        for name in chosen:
-            try:
-                scene = load_scene(name, plan.scale, data, shared)
-                measurement.scene(scene, contenders)
-            except AbsentError as absent:
-                measurement.skipped.append(str(absent))
-                note(str(absent))
-        ours_alone = measurement.process("pileus")
-        bars = [
-            *bars_of(measurement.points),
-            refinement(ours_alone, ours, plan, data),
-            *threads(ours_alone, ours, plan, data),
-        ]
-        denoised = []
-        if peers and CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
-            denoised = end_to_end(ours_alone, peers_python, plan.scale, data, shared)
-            bars.append(denoised_bar(denoised))
-        result = Chart(
+    bars: list[Bar] = []
+    denoised: list[EndToEnd] = []
+
+    def charted() -> Chart:
+        known = [*bars_of(measurement.points), *bars]
+        return Chart(
             kind="full" if full else "small",
             command=shlex.join(["pileus", *sys.argv[1:]]),
             version=core.__version__,
@@ -103,9 +94,28 @@ def chart(
             points=measurement.points,
             starts=list(measurement.starts.values()),
             end_to_end=denoised,
-            bars=[bar for bar in bars if bar.values],
+            bars=[bar for bar in known if bar.values],
             skipped=measurement.skipped,
         )
+
+    with plain_errors("chart"), Measurement(plan, data, pythons, note) as measurement:
+        contenders = measurement.start([*ours, *(PEERS if peers else [])])
+        for name in chosen:
+            try:
+                scene = load_scene(name, plan.scale, data, shared)
+                measurement.scene(scene, contenders)
+            except AbsentError as absent:
+                measurement.skipped.append(str(absent))
+                note(str(absent))
+            if out is not None and measurement.points:
+                _write(charted(), out, page)  # an hour's work may be cut short
+        pileus = measurement.process("pileus")
+        bars.append(refinement(pileus, ours, plan, data))
+        bars.extend(threads(pileus, ours, plan, data))
+        if CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
+            denoised.extend(end_to_end(pileus, peers_python, plan.scale, data, shared))
+            bars.append(denoised_bar(denoised))
+        result = charted()
     if out is not None:
         _write(result, out, page)
     if as_json:
