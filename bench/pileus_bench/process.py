@@ -29,7 +29,7 @@ class Spent(BaseModel):
 
 
 class RendererProcess:
-    """Starts the module with an interpreter; `start_seconds` is what that cost."""
+    """Starts the module with an interpreter; `start_seconds` is what that took."""
 
     def __init__(self, module: str, python: str) -> None:
         self._module = module
@@ -45,10 +45,12 @@ class RendererProcess:
             env={**os.environ, "PYTHONPATH": str(here)},
         )
         try:
-            self.start_seconds = float(self._answer()["seconds"])
+            told = self._answer()
         except RendererError:
             self.close()
             raise
+        self.start_seconds = float(told["seconds"])
+        self.about = str(told["about"])
 
     def __enter__(self) -> Self:
         return self

@@ -79,7 +79,9 @@ class Measurement:
                 self._skip(f"{error}; skipped")
                 continue
             self._processes[module] = self._stack.enter_context(process)
-            self.starts[module] = Start(renderer=module, start=process.start_seconds, load={})
+            self.starts[module] = Start(
+                renderer=process.about, start=process.start_seconds, load={}
+            )
         return [each for each in contenders if each.renderer not in absent]
 
     def process(self, renderer: str) -> RendererProcess:

@@ -27,6 +27,7 @@ class Cycles:
         import OpenImageIO
 
         self._oiio: Any = OpenImageIO
+        self.about = f"Cycles {bpy.app.version_string}"
         self._bpy: Any = bpy
         self._mathutils: Any = mathutils
         self._size = (0, 0)

@@ -23,6 +23,7 @@ class Mitsuba:
 
         self._mitsuba: Any = mitsuba
         self._llvm = _llvm_works(mitsuba)
+        self.about = f"Mitsuba {mitsuba.__version__} ({'LLVM' if self._llvm else 'scalar, slow'})"
         self._scene: Any = None
 
     def load(self, view: dict[str, Any]) -> None:

@@ -11,6 +11,8 @@ from pileus_worker import scene
 
 
 class Pileus:
+    about = f"Pileus {core.__version__}"
+
     def load(self, view: dict[str, Any]) -> None:
         self._shot = Shot.model_validate(view["shot"])
         self._frame = int(view["frame"])

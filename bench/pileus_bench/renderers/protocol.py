@@ -17,7 +17,9 @@ Image = NDArray[np.float32]
 
 
 class Renderer(Protocol):
-    """Renders one view at a time; what a view holds is `scenes.View`, as JSON."""
+    """Renders one view at a time; what a view holds `scenes.view_of` says."""
+
+    about: str  # name, version and whatever decides its speed
 
     def load(self, view: dict[str, Any]) -> None:
         """Makes ready all that is the same for every render of the view, compiled and warm."""
@@ -41,7 +43,7 @@ def serve(begin: Callable[[], Renderer]) -> None:
     except Exception as error:
         answer({"error": f"{type(error).__name__}: {error}"})
         return
-    answer({"seconds": time.perf_counter() - begun})
+    answer({"seconds": time.perf_counter() - begun, "about": renderer.about})
     for line in sys.stdin:
         try:
             answer(_answer_to(json.loads(line), renderer))
