@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pileus_core as core
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from pileus_service.frames import expand
@@ -28,12 +29,20 @@ class Recipe(BaseModel):
     resolution: int = 128
     seed: int = 0
     file: str | None = None
+    voxel: float | None = None  # its side in world units, for a file
 
     @model_validator(mode="after")
     def _one_source(self) -> "Recipe":
         if (self.make is None) == (self.file is None):
             raise ValueError("give either make or file")
+        if (self.file is None) != (self.voxel is None):
+            raise ValueError("a file, and only a file, needs its voxel")
         return self
+
+    @property
+    def side(self) -> float:
+        """Of a voxel, in world units."""
+        return self.voxel or 1 / self.resolution
 
 
 class AbsentError(Exception):
@@ -46,6 +55,7 @@ class BenchScene:
 
     name: str
     shot: Shot
+    voxel: float
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -83,7 +93,7 @@ def load_scene(
         shot = shot.model_copy(update={"volumes": (volume,)})
     else:
         _make(recipe, shot)
-    return BenchScene(name, shot)
+    return BenchScene(name, shot, recipe.side)
 
 
 def _make(recipe: Recipe, shot: Shot) -> None:
@@ -114,21 +124,23 @@ def view_of(scene: BenchScene, frame: int, data: Path) -> dict[str, Any]:
     shot = scene.shot
     medium, pose, cache = shot.volumes[0], shot.camera.at(frame), cache_path(shot, frame)
     volume = core.Volume(str(cache), medium.density)
-    dense = volume.dense()
-    if dense is None:
+    bounds = volume.world_bounds
+    if bounds is None:
         raise AbsentError(f"{scene.name}: skipped, frame {frame} of its cache is empty")
-    voxels, index_to_world = dense
-    file = data / "voxels" / f"{scene.name}.{frame:04d}.npy"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    np.save(file, voxels)
-    low, high = volume.world_bounds or (pose.position, pose.position)
+    low, high = bounds
+    file = data / "voxels" / f"{scene.name}.{frame:04d}.{scene.voxel:g}.npy"
+    if not file.is_file() or file.stat().st_mtime < cache.stat().st_mtime:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.save(file, dense(volume, scene.voxel))
+    index_to_world = np.diag([scene.voxel, scene.voxel, scene.voxel, 1.0])
+    index_to_world[3, :3] = low
     return {
         "shot": shot.model_dump(mode="json"),
         "frame": frame,
         "cache": str(cache),
         "grid": medium.density,
         "voxels": str(file),
-        "index_to_world": index_to_world,
+        "index_to_world": index_to_world.flatten().tolist(),
         "extinction": medium.extinction,
         "albedo": medium.albedo,
         "anisotropy": medium.anisotropy,
@@ -138,6 +150,19 @@ def view_of(scene: BenchScene, frame: int, data: Path) -> dict[str, Any]:
         "width": shot.image.width,
         "height": shot.image.height,
     }
+
+
+def dense(volume: core.Volume, voxel: float) -> NDArray[np.float32]:
+    """A volume that is not empty and lies along the axes as an array of shape (z, y, x).
+
+    Its voxels are those that Pileus interpolates, from the lower corner of the world's box on.
+    """
+    low, high = (np.asarray(corner) for corner in volume.world_bounds or ((0,) * 3, (0,) * 3))
+    counts = np.rint((high - low) / voxel).astype(int) + 1
+    xs, ys, zs = (low[axis] + voxel * np.arange(counts[axis]) for axis in range(3))
+    at = volume.interpolate
+    values = (at((x, y, z)) for z in zs for y in ys for x in xs)
+    return np.fromiter(values, np.float32, int(counts.prod())).reshape(counts[::-1])
 
 
 def _light(light: Any) -> dict[str, Any]:

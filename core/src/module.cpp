@@ -163,29 +163,6 @@ NB_MODULE(_core, m) {
             },
             "position"_a,
             "The density at a world position near the volume, interpolated trilinearly.")
-        .def(
-            "dense",
-            [](const Volume& volume) -> std::optional<std::pair<Pixels, std::vector<double>>> {
-                if (volume.empty()) return std::nullopt;
-                const BrickTree& tree = volume.tree();
-                const V3i low = tree.low(), size = tree.high() - low + V3i(1);
-                std::vector<float> values;
-                values.reserve(static_cast<std::size_t>(size.x) * static_cast<std::size_t>(size.y) *
-                               static_cast<std::size_t>(size.z));
-                for (int z = 0; z < size.z; ++z) {
-                    for (int y = 0; y < size.y; ++y) {
-                        for (int x = 0; x < size.x; ++x)
-                            values.push_back(tree.voxel(low + V3i(x, y, z)));
-                    }
-                }
-                const auto side = [](int n) { return static_cast<std::size_t>(n); };
-                return std::pair{
-                    to_array(std::move(values), {side(size.z), side(size.y), side(size.x)}),
-                    flatten(Imath::M44d().setTranslation(V3d(low)) * volume.local_to_world())};
-            },
-            "All voxels as an array of shape (z, y, x), a layer of zeros around them, and the way "
-            "from its indices (x, y, z) to the world: 16 values, row by row, for row vectors. None "
-            "for an empty grid.")
         .def_prop_ro(
             "world_bounds",
             [](const Volume& volume) -> std::optional<std::pair<Triple, Triple>> {
