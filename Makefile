@@ -79,7 +79,7 @@ $(VENV)/.core: $(CORE) $(VENV)/.venv
 	@touch $@
 
 $(VENV)/.pileus: pyproject.toml $(VENV)/.core
-	$(PIP) --editable '.[worker,dev]'
+	$(PIP) --editable '.[worker,denoise,dev]'
 	@touch $@
 
 build/.built: $(CORE) $(VENV)/.system

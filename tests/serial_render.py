@@ -10,6 +10,7 @@ from pileus_service.jobs import Plan
 from pileus_service.shot import Shot
 from pileus_service.store import Store
 from pileus_worker import scene
+from pileus_worker.denoising import denoise
 
 
 def plan_of(data: Path, job: str, frame: int) -> Plan:
@@ -39,6 +40,7 @@ def rendered_here(shot: Shot, plan: Plan) -> core.Frame:
                 frame=plan.frame,
             )
         )
+    denoise(frame, shot, threads=1)
     return frame
 
 

@@ -107,6 +107,17 @@ def test_the_farms_frames_equal_those_of_pileus_render(
     assert preview.read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_farm_denoises_whole_frames(client: Client, real_shot: Shot, tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn")
+    image = real_shot.image.model_copy(update={"denoise": True})
+    shot = real_shot.model_copy(update={"image": image, "frames": "2"})
+    job = client.submit(shot).job.id
+    finish(client, job)
+    assert len({part.bucket for part in plan_of(tmp_path, job, 2).parts}) > 1
+    assert "noisy.R" in pixels(shot.output(2))
+    same_bits(shot, tmp_path, job, 2)
+
+
 def test_killed_workers_change_no_bit(
     farm: EmbeddedFarm, client: Client, long_shot: Shot, tmp_path: Path
 ) -> None:

@@ -100,6 +100,28 @@ void Frame::require_complete() const {
     }
 }
 
+void Frame::set_denoised(const std::vector<std::vector<float>>& colors) {
+    require_complete();
+    const std::size_t pixels = image_.window().pixels(), rendered = image_.channels().size();
+    const auto fits = [&](const auto& rgb) { return rgb.size() == 3 * pixels; };
+    if (colors.size() != image_.looks().size() ||
+        !std::all_of(colors.begin(), colors.end(), fits)) {
+        throw InputError("the denoised colours do not fit the image");
+    }
+    std::vector<std::string> channels = image_.channels();
+    for (const char* name : {"noisy.R", "noisy.G", "noisy.B"}) channels.emplace_back(name);
+    LayeredImage image(image_.window(), image_.looks(), channels);
+    for (std::size_t look = 0; look < colors.size(); ++look) {
+        std::copy_n(image_.plane(look, 0), rendered * pixels, image.plane(look, 0));
+        std::copy_n(image_.plane(look, Partial::r), 3 * pixels, image.plane(look, rendered));
+        for (std::size_t c = 0; c < 3; ++c) {
+            float* const plane = image.plane(look, Partial::r + c);
+            for (std::size_t i = 0; i < pixels; ++i) plane[i] = colors[look][3 * i + c];
+        }
+    }
+    image_ = std::move(image);
+}
+
 void Frame::write(const std::string& path, bool half, const Header& header) const {
     require_complete();
     write_exr(path, image_, width_, height_, half, header);

@@ -20,6 +20,11 @@ class Frame {
     /// is of another frame.
     void add(const Partial& partial);
 
+    /// Puts denoised colours in the place of R, G and B, for each look in turn (RGB, pixel by
+    /// pixel); what was rendered stays as noisy.R, noisy.G and noisy.B. Throws InputError where a
+    /// bucket lacks samples or the colours do not fit the image.
+    void set_denoised(const std::vector<std::vector<float>>& colors);
+
     /// Writes the whole image. Throws InputError where a bucket lacks samples, std::runtime_error
     /// where the file cannot be written.
     void write(const std::string& path, bool half, const Header& header) const;

@@ -326,6 +326,19 @@ NB_MODULE(_core, m) {
             "Whole or not at all. Raises InputError where samples are missing, RuntimeError where "
             "it cannot be written.")
         .def(
+            "set_denoised",
+            [](Frame& frame,
+               const std::vector<nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig,
+                                             nb::device::cpu>>& colors) {
+                std::vector<std::vector<float>> values;
+                for (const auto& rgb : colors)
+                    values.emplace_back(rgb.data(), rgb.data() + rgb.size());
+                frame.set_denoised(values);
+            },
+            "colors"_a,
+            "Puts denoised RGB of shape (height, width, 3), one array a look, in the place of the "
+            "rendered, which is kept as noisy.R, noisy.G and noisy.B. Raises InputError.")
+        .def(
             "pixels",
             [](const Frame& frame, const std::string& look) {
                 return rgba_of(frame.image(), frame.image().look_index(look));

@@ -63,6 +63,7 @@ class Image(Model):
     pixel_type: Literal["float", "half"] = "float"
     orders: Flag = False
     background: Flag = True
+    denoise: Flag = False
 
     @field_validator("output")
     @classmethod

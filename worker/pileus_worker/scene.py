@@ -100,7 +100,7 @@ def identity(shot: Shot, frame: int, cache: Cache) -> str:
         "frame": frame,
         "cache": cache.model_dump(),
         "camera": shot.camera.at(frame).model_dump(),
-        "image": shot.image.model_dump(exclude={"output", "pixel_type"}),
+        "image": shot.image.model_dump(exclude={"output", "pixel_type", "denoise"}),
         "version": core.__version__,
         **shot.model_dump(mode="json", include={"volumes", "lights", "transport", "sampling"}),
     }

@@ -30,6 +30,7 @@ from pileus_service.roots import Roots
 from pileus_service.store import FrameStore, Store, sync_folder
 from pileus_worker import planning, scene
 from pileus_worker.caches import Caches
+from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.paths import PathMap
 from pileus_worker.pictures import write_preview
 
@@ -92,6 +93,7 @@ class Work:
 
     def _plan(self, files: FrameStore) -> Planned | Waiting:
         """Makes the frame's plan, or takes up one that is there, with what it has finished."""
+        check_installed(self.job.shot, self.job.shot.name)
         if self.job.wait_for_caches and (trouble := self._unready(files)):
             return Waiting(wait=trouble)
         cache = scene.cache_of(self.job.shot, self.frame, self.paths)
@@ -191,6 +193,8 @@ class Work:
             return Merged(redo=redo, reason=trouble)
         for partial in self._empty_buckets(plan):
             frame.add(partial)
+        with self._phase("denoise"):
+            denoise(frame, shot, self.threads)
         with self._phase("write"):
             self._write(files, frame, time.time() - plan.begun)
         return Merged()

@@ -16,6 +16,7 @@ from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files, load_shot
 from pileus_worker import machine, scene
 from pileus_worker.caches import Caches
+from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.errors import plain_errors
 
 app = typer.Typer()
@@ -39,6 +40,7 @@ def render(
         output = str(out.resolve() / Path(shot.image.output).name)
         shot = shot.model_copy(update={"image": shot.image.model_copy(update={"output": output})})
     check_files(shot, str(shot_file), shot.frame_numbers)
+    check_installed(shot, str(shot_file))
     for warning in shot.warnings():
         print(f"{shot_file}: warning: {warning}", file=sys.stderr)
     with plain_errors(str(shot_file)), Display() as display:
@@ -79,6 +81,7 @@ class Renderer:
         whole = (0, 0, image.width, image.height)
         frame = core.Frame(image.width, image.height, [(whole, shot.sampling.samples)])
         frame.add(partial)
+        denoise(frame, shot, self._threads)
         output = shot.output(number)
         output.parent.mkdir(parents=True, exist_ok=True)
         header = scene.header(shot, number, self._transport, render_seconds)

@@ -1,0 +1,117 @@
+"""Denoised frames: nearer to the truth, with nothing else of them changed."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+import pytest
+from numpy.typing import NDArray
+
+from pileus_service.shot import Shot
+from pileus_worker.denoising import smoothed
+
+pytest.importorskip("pyoidn", reason="Open Image Denoise has no wheel for this machine")
+
+Channels = dict[str, NDArray[np.float32]]
+PILEUS = str(Path(sys.executable).with_name("pileus"))
+
+
+@pytest.fixture
+def noisy(tmp_path: Path, shot: dict[str, Any]) -> Shot:
+    """One frame of few samples, with two looks and all channels."""
+    (tmp_path / "caches").mkdir()
+    core.make_cloud(str(tmp_path / "caches" / "cloud.0001.vdb"), frame=1, frames=2, resolution=64)
+    shot["frames"] = "1"
+    shot["image"] |= {"width": 160, "height": 90, "orders": True, "denoise": True}
+    shot["transport"]["looks"] = [{"name": "hero", "a": 0.65, "b": 0.65, "c": 0.5}, {"name": "own"}]
+    return Shot.model_validate(shot)
+
+
+def changed(shot: Shot, section: str, **values: Any) -> Shot:
+    part = getattr(shot, section).model_copy(update=values)
+    return shot.model_copy(update={section: part})
+
+
+def rendered(shot: Shot, file: Path, threads: int = 2) -> dict[str, Channels]:
+    """Each look's channels, as `pileus render` writes them."""
+    (file.parent / "shot.json").write_text(
+        changed(shot, "image", output=str(file)).model_dump_json()
+    )
+    command = [PILEUS, "render", str(file.parent / "shot.json"), "--threads", str(threads)]
+    subprocess.run(command, check=True, capture_output=True)
+    return {look: dict(channels) for look, channels in core.read_image(str(file)).items()}
+
+
+def rel_mse(image: Channels, truth: Channels, prefix: str = "") -> float:
+    error = [(image[prefix + c] - truth[c]) ** 2 / (truth[c] ** 2 + 0.01) for c in "RGB"]
+    return float(np.mean(error))
+
+
+def test_colours_come_nearer_to_the_truth_and_nothing_else_changes(
+    noisy: Shot, tmp_path: Path
+) -> None:
+    denoised = rendered(noisy, tmp_path / "denoised.exr")
+    plain = rendered(changed(noisy, "image", denoise=False), tmp_path / "plain.exr")
+    few = changed(noisy, "image", denoise=False, orders=False)
+    truth = rendered(changed(few, "sampling", samples=128, seed=8), tmp_path / "truth.exr")
+    for look, channels in plain.items():
+        own = denoised[look]
+        assert own.keys() == channels.keys() | {"noisy.R", "noisy.G", "noisy.B"}
+        for name, values in channels.items():
+            kept = f"noisy.{name}" if name in "RGB" else name
+            np.testing.assert_array_equal(own[kept], values, f"{look} {name}")
+        assert rel_mse(own, truth[look]) < 0.2 * rel_mse(own, truth[look], "noisy.")
+    assert not np.array_equal(denoised["hero"]["R"], denoised["own"]["R"])
+
+
+def test_neither_threads_nor_other_looks_change_a_bit(noisy: Shot, tmp_path: Path) -> None:
+    both = rendered(noisy, tmp_path / "both.exr")
+    alone = changed(noisy, "transport", looks=noisy.transport.looks[1:])
+    [one] = rendered(alone, tmp_path / "alone.exr", threads=1).values()
+    for name, values in one.items():
+        np.testing.assert_array_equal(both["own"][name], values, name)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200)])
+def test_images_of_any_shape_are_denoised(
+    noisy: Shot, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    shot = changed(noisy, "image", width=size[0], height=size[1])
+    for channels in rendered(shot, tmp_path / "odd.exr").values():
+        assert channels["R"].shape == size[::-1]
+        assert all(np.isfinite(channels[c]).all() and (channels[c] >= 0).all() for c in "RGB")
+
+
+def test_the_guide_keeps_the_opacitys_mean_and_range() -> None:
+    opacity = np.zeros((5, 6), np.float32)
+    opacity[2, 3] = 1.0
+    guide = smoothed(opacity)
+    assert guide.shape == (5, 6, 3)
+    kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16
+    for channel in range(3):
+        np.testing.assert_allclose(guide[1:4, 2:5, channel], kernel)
+    np.testing.assert_allclose(guide.sum(), 3.0)
+    np.testing.assert_array_equal(smoothed(np.ones((1, 1), np.float32)), 1.0)
+
+
+def test_where_the_denoiser_is_missing_a_line_says_so_before_anything_is_rendered(
+    noisy: Shot, tmp_path: Path
+) -> None:
+    file = tmp_path / "shot.json"
+    file.write_text(noisy.model_dump_json())
+    program = f"""
+import sys
+sys.modules["pyoidn"] = None
+sys.argv = ["pileus", "render", {str(file)!r}]
+from pileus_service.cli import main
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1
+    assert f"{file}: image.denoise: " in ended.stderr
+    assert "pip install 'pileus[denoise]'" in ended.stderr
+    assert not (tmp_path / "out").exists()

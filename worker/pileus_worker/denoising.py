@@ -1,0 +1,86 @@
+"""Denoises a whole frame, look by look, with Intel's Open Image Denoise (OIDN).
+
+The one guide image is the frame's own opacity: it tells the filter where the volume ends. What
+other guides bring to volumes, and what they cost, is measured in docs/denoising.md.
+"""
+
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+from numpy.typing import NDArray
+
+from pileus_service.errors import FarmError, InputError
+from pileus_service.shot import Shot
+
+Pixels = NDArray[np.float32]
+
+
+def check_installed(shot: Shot, source: str) -> None:
+    """Refuses a shot that wants denoising where OIDN is missing, before anything is rendered."""
+    if shot.image.denoise and find_spec("pyoidn") is None:
+        raise InputError(
+            f"{source}: image.denoise: needs Open Image Denoise, which is not installed; "
+            "pip install 'pileus[denoise]', or set it to false"
+        )
+
+
+def denoise(frame: core.Frame, shot: Shot, threads: int) -> None:
+    """Puts denoised colours into a frame that is complete, where the shot wants them."""
+    if not shot.image.denoise:
+        return
+    filter_ = _Filter(threads)
+    images = [frame.pixels(look.name) for look in shot.transport.looks]
+    guide = smoothed(images[0][..., 3])
+    frame.set_denoised([filter_(image, guide) for image in images])
+
+
+class _Filter:
+    """OIDN's filter for rendered images, on so many threads."""
+
+    def __init__(self, threads: int) -> None:
+        import pyoidn  # optional, and slow to load
+
+        self._oidn = pyoidn
+        self._device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
+        self._device.set_int("numThreads", threads)
+        # Other workers share the machine: the system knows better where threads belong.
+        self._device.set_bool("setAffinity", False)
+        self._device.commit()
+        self._check()
+
+    def __call__(self, image: Pixels, guide: Pixels) -> Pixels:
+        """RGB of an image (height, width, 4), guided by an image in [0, 1] (height, width, 3)."""
+        oidn = self._oidn
+        height, width, channels = image.shape
+        output = np.empty((height, width, 3), np.float32)
+        with oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT) as rt:
+            stride = channels * image.itemsize
+            rt.set_image("color", image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
+            rt.set_image("albedo", guide, oidn.OIDN_FORMAT_FLOAT3)
+            rt.set_image("output", output, oidn.OIDN_FORMAT_FLOAT3)
+            rt.set_bool("hdr", True)
+            rt.set_quality(oidn.OIDN_QUALITY_HIGH)
+            rt.commit()
+            rt.execute()
+            self._check()
+        return output
+
+    def _check(self) -> None:
+        error: Any = self._device.get_error()
+        if error is not None:
+            raise FarmError(f"image.denoise: Open Image Denoise fails: {error}")
+
+
+def smoothed(opacity: Pixels) -> Pixels:
+    """The opacity (height, width) as a guide (height, width, 3): the noise that single hits and
+    misses give it is evened out over neighbours with the weights 1, 2, 1."""
+    for axis in (0, 1):
+        edges = [(1, 1) if axis == each else (0, 0) for each in (0, 1)]
+        padded = np.pad(opacity, edges, "edge")
+        before, here, after = (
+            np.take(padded, range(i, i + opacity.shape[axis]), axis) for i in range(3)
+        )
+        opacity = np.asarray((before + 2 * here + after) / 4, np.float32)
+    return np.repeat(opacity[..., np.newaxis], 3, axis=-1)
