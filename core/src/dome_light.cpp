@@ -1,8 +1,7 @@
 // A dome: constant radiance, or a lat-long texture importance sampled by luminance and solid angle.
 #include "error.h"
 #include "light.h"
-
-#include <OpenImageIO/imageio.h>
+#include "texture.h"
 
 #include <algorithm>
 #include <cmath>
@@ -154,26 +153,12 @@ std::unique_ptr<const Light> make_dome_light(const Color& radiance, const std::s
                                              std::vector<std::string>& warnings) {
     if (texture.empty()) return std::make_unique<ConstantDome>(radiance);
 
-    const auto input = OIIO::ImageInput::open(texture);
-    if (!input)
-        throw InputError(texture + ": cannot be read as an image (" + OIIO::geterror() + ")");
-    const OIIO::ImageSpec& spec = input->spec();
-    if (spec.width < 1 || spec.height < 1 || spec.nchannels < 1 ||
-        std::int64_t{spec.width} * spec.height > (1 << 28)) {
-        throw InputError(texture + ": is not a lat-long image of at most 2^28 pixels");
-    }
-    const int channels = std::min(spec.nchannels, 3);
-    std::vector<float> values(static_cast<std::size_t>(spec.width) *
-                              static_cast<std::size_t>(spec.height) *
-                              static_cast<std::size_t>(channels));
-    if (!input->read_image(0, 0, 0, channels, OIIO::TypeDesc::FLOAT, values.data())) {
-        throw InputError(texture + ": cannot be read whole (" + input->geterror() + ")");
-    }
-
+    const Texture image = read_texture(texture);
+    const int channels = image.channels;
     std::int64_t odd = 0;
     std::vector<Color> texels;
-    texels.reserve(values.size() / static_cast<std::size_t>(channels));
-    for (auto value = values.begin(); value != values.end(); value += channels) {
+    texels.reserve(image.values.size() / static_cast<std::size_t>(channels));
+    for (auto value = image.values.begin(); value != image.values.end(); value += channels) {
         Color color(value[0], value[channels > 1 ? 1 : 0], value[channels > 2 ? 2 : 0]);
         for (int c = 0; c < 3; ++c) {
             if (std::isfinite(color[c]) && color[c] >= 0.0f) continue;
@@ -186,7 +171,7 @@ std::unique_ptr<const Light> make_dome_light(const Color& radiance, const std::s
         warnings.push_back(texture + ": " + std::to_string(odd) +
                            " values are NaN, infinite or negative; taken as 0");
     }
-    return std::make_unique<TexturedDome>(std::move(texels), spec.width, spec.height);
+    return std::make_unique<TexturedDome>(std::move(texels), image.width, image.height);
 }
 
 }  // namespace pileus
