@@ -1,7 +1,7 @@
 """Denoises a whole frame, look by look, with Intel's Open Image Denoise (OIDN).
 
-The one guide image is the frame's own opacity: it tells the filter where the volume ends. What
-other guides bring to volumes, and what they cost, is measured in docs/denoising.md.
+The one guide image is made of the frame's own opacity: it tells the filter where the volume ends.
+What other guides bring to volumes, and what they cost, is measured in docs/denoising.md.
 """
 
 from importlib.util import find_spec
@@ -32,7 +32,7 @@ def denoise(frame: core.Frame, shot: Shot, threads: int) -> None:
         return
     filter_ = _Filter(threads)
     images = [frame.pixels(look.name) for look in shot.transport.looks]
-    guide = smoothed(images[0][..., 3])
+    guide = guide_of(images[0][..., 3])
     frame.set_denoised([filter_(image, guide) for image in images])
 
 
@@ -73,9 +73,10 @@ class _Filter:
             raise FarmError(f"image.denoise: Open Image Denoise fails: {error}")
 
 
-def smoothed(opacity: Pixels) -> Pixels:
-    """The opacity (height, width) as a guide (height, width, 3): the noise that single hits and
-    misses give it is evened out over neighbours with the weights 1, 2, 1."""
+def guide_of(opacity: Pixels) -> Pixels:
+    """What stands for an albedo, of shape (height, width, 3): white where the opacity (height,
+    width) is 1, mid-grey where it is 0. The noise that single hits and misses give it is evened
+    out over neighbours with the weights 1, 2, 1."""
     for axis in (0, 1):
         edges = [(1, 1) if axis == each else (0, 0) for each in (0, 1)]
         padded = np.pad(opacity, edges, "edge")
@@ -83,4 +84,4 @@ def smoothed(opacity: Pixels) -> Pixels:
             np.take(padded, range(i, i + opacity.shape[axis]), axis) for i in range(3)
         )
         opacity = np.asarray((before + 2 * here + after) / 4, np.float32)
-    return np.repeat(opacity[..., np.newaxis], 3, axis=-1)
+    return np.repeat((opacity[..., np.newaxis] + 1) / 2, 3, axis=-1)
