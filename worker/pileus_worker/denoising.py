@@ -30,13 +30,13 @@ def denoise(frame: core.Frame, shot: Shot, threads: int) -> None:
     """Puts denoised colours into a frame that is complete, where the shot wants them."""
     if not shot.image.denoise:
         return
-    filter_ = _Filter(threads)
+    filter_ = Filter(threads)
     images = [frame.pixels(look.name) for look in shot.transport.looks]
     guide = guide_of(images[0][..., 3])
-    frame.set_denoised([filter_(image, guide) for image in images])
+    frame.set_denoised([filter_({"color": image, "albedo": guide}) for image in images])
 
 
-class _Filter:
+class Filter:
     """OIDN's filter for rendered images, on so many threads."""
 
     def __init__(self, threads: int) -> None:
@@ -50,17 +50,19 @@ class _Filter:
         self._device.commit()
         self._check()
 
-    def __call__(self, image: Pixels, guide: Pixels) -> Pixels:
-        """RGB of an image (height, width, 4), guided by an image in [0, 1] (height, width, 3)."""
+    def __call__(self, images: dict[str, Pixels]) -> Pixels:
+        """Filters a linear `color` of any range with the guides `albedo` and `normal`, or a guide
+        alone. All are of shape (height, width, 3 or more) and their first three channels count;
+        returns (height, width, 3). Raises FarmError."""
         oidn = self._oidn
-        height, width, channels = image.shape
+        height, width = next(iter(images.values())).shape[:2]
         output = np.empty((height, width, 3), np.float32)
         with oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT) as rt:
-            stride = channels * image.itemsize
-            rt.set_image("color", image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
-            rt.set_image("albedo", guide, oidn.OIDN_FORMAT_FLOAT3)
-            rt.set_image("output", output, oidn.OIDN_FORMAT_FLOAT3)
-            rt.set_bool("hdr", True)
+            for name, image in {**images, "output": output}.items():
+                stride = image.shape[2] * image.itemsize
+                rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
+            if "color" in images:
+                rt.set_bool("hdr", True)
             rt.set_quality(oidn.OIDN_QUALITY_HIGH)
             rt.commit()
             rt.execute()

@@ -1,0 +1,129 @@
+"""Measures the denoiser on a shot's frames: its error by guide image, and how much it flickers.
+
+    python bench/denoising.py SHOT [--frames F] [--samples 1,4,16] [--repeats N] [--truth N]
+
+The truth of a frame is two independent halves A and B by the shot's own method. The mean of
+(x - A)(x - B) is then the squared error without the truth's noise, and that of the same product of
+frame-to-frame changes is the squared flicker: the change that the truth does not share. All are
+relative as relMSE is, (r^2 + 0.01) below the line.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pileus_core as core
+from numpy.typing import NDArray
+
+from pileus_service.shot import Shot
+from pileus_service.shotfile import load_shot
+from pileus_worker import machine, scene
+from pileus_worker.denoising import Filter, Pixels, guide_of
+
+Stack = NDArray[np.float64]  # (frames, height, width, 3)
+TRUTH_SEEDS = (1_000_001, 1_000_002)
+
+
+class Frames:
+    """A shot's frames with their caches in memory."""
+
+    def __init__(self, shot: Shot) -> None:
+        self._shot = shot
+        self._scenes = {
+            frame: scene.make_scene(
+                shot,
+                frame,
+                core.Volume(str(scene.cache_path(shot, frame)), shot.volumes[0].density),
+            )
+            for frame in shot.frame_numbers
+        }
+
+    def render(self, samples: int, seed: int, moving: bool = True) -> list[Pixels]:
+        """RGBA of each frame; where it is not `moving`, all frames have the noise of the first."""
+        size = (self._shot.image.width, self._shot.image.height)
+        images = []
+        for frame, view in self._scenes.items():
+            whole = core.Frame(*size, [((0, 0, *size), samples)])
+            whole.add(
+                core.render(
+                    view,
+                    scene.make_transport(self._shot),
+                    bucket=(0, 0, *size),
+                    samples=(0, samples),
+                    seed=seed,
+                    frame=frame if moving else self._shot.frame_numbers[0],
+                )
+            )
+            images.append(whole.pixels(self._shot.transport.looks[0].name))
+        return images
+
+
+def guides(filter_: Filter) -> dict[str, Callable[[Pixels], Pixels | None]]:
+    """What may stand for an albedo, by name, each made of an RGBA image."""
+
+    def grey(values: Pixels) -> Pixels:
+        return np.repeat(np.asarray(values, np.float32)[..., np.newaxis], 3, axis=-1)
+
+    return {
+        "none": lambda image: None,
+        "white": lambda image: grey(np.ones_like(image[..., 3])),
+        "opacity": lambda image: grey(image[..., 3]),
+        "prefiltered opacity": lambda image: filter_({"albedo": grey(image[..., 3])}),
+        "mid-grey to white": lambda image: guide_of(image[..., 3]),
+    }
+
+
+def denoised(filter_: Filter, image: Pixels, guide: Pixels | None) -> Pixels:
+    return filter_({"color": image} | ({} if guide is None else {"albedo": guide}))
+
+
+def stack(images: list[Pixels]) -> Stack:
+    return np.stack([image[..., :3] for image in images]).astype(np.float64)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measures the denoiser on a shot's frames.")
+    parser.add_argument("shot", type=Path)
+    parser.add_argument("--frames")
+    parser.add_argument("--samples", default="1,4,16")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--truth", type=int, default=256)
+    asked = parser.parse_args()
+    shot = load_shot(asked.shot, [f'frames="{asked.frames}"'] if asked.frames else [])
+    frames, filter_ = Frames(shot), Filter(machine.cores())
+    a, b = (stack(frames.render(asked.truth, seed)) for seed in TRUTH_SEEDS)
+    weight = 1 / (((a + b) / 2) ** 2 + 0.01)
+
+    def error(x: Stack) -> float:
+        return float(np.mean((x - a) * (x - b) * weight))
+
+    def change(x: Stack, y: Stack) -> float:
+        """Of two sequences' frame-to-frame changes, the mean product."""
+        both = np.diff(x, axis=0) * np.diff(y, axis=0)
+        return float(np.mean(both * (weight[1:] + weight[:-1]) / 2))
+
+    truth_change = change(a, b) ** 0.5 if len(a) > 1 else 0.0
+    print(f"the truth changes by {truth_change:.2%} from frame to frame")
+    print("samples | noise | guide | relMSE | flicker")
+    for samples in map(int, asked.samples.split(",")):
+        for moving in (True, False) if len(a) > 1 else (True,):
+            runs = [frames.render(samples, seed, moving) for seed in range(1, asked.repeats + 1)]
+            kinds = {"not denoised": [stack(run) for run in runs]}
+            for name, guide in guides(filter_).items():
+                kinds[name] = [
+                    stack([denoised(filter_, image, guide(image)) for image in run]) for run in runs
+                ]
+            for name, sequences in kinds.items():
+                errors = [error(x) for x in sequences]
+                spread = np.std(errors) / max(1, len(errors) - 1) ** 0.5
+                flicker = np.mean([change(x - a, x - b) for x in sequences]) if len(a) > 1 else 0.0
+                print(
+                    f"{samples} | {'moving' if moving else 'still'} | {name} | "
+                    f"{np.mean(errors):.2e} +- {spread:.1e} | {max(0.0, flicker) ** 0.5:.2%}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
