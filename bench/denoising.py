@@ -1,6 +1,6 @@
 """Measures the denoiser on a shot's frames: its error by guide image, and how much it flickers.
 
-    python bench/denoising.py SHOT [--frames F] [--samples 1,4,16] [--repeats N] [--truth N]
+    python bench/denoising.py SHOT [--set KEY=VALUE] [--samples 1,4,16] [--repeats N] [--truth N]
 
 The truth of a frame is two independent halves A and B by the shot's own method. The mean of
 (x - A)(x - B) is then the squared error without the truth's noise, and that of the same product of
@@ -85,12 +85,12 @@ def stack(images: list[Pixels]) -> Stack:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measures the denoiser on a shot's frames.")
     parser.add_argument("shot", type=Path)
-    parser.add_argument("--frames")
+    parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--samples", default="1,4,16")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--truth", type=int, default=256)
     asked = parser.parse_args()
-    shot = load_shot(asked.shot, [f'frames="{asked.frames}"'] if asked.frames else [])
+    shot = load_shot(asked.shot, asked.set)
     frames, filter_ = Frames(shot), Filter(machine.cores())
     a, b = (stack(frames.render(asked.truth, seed)) for seed in TRUTH_SEEDS)
     weight = 1 / (((a + b) / 2) ** 2 + 0.01)
