@@ -113,9 +113,9 @@ def test_the_farm_denoises_whole_frames(client: Client, real_shot: Shot, tmp_pat
     shot = real_shot.model_copy(update={"image": image, "frames": "2"})
     job = client.submit(shot).job.id
     finish(client, job)
-    assert len({part.bucket for part in plan_of(tmp_path, job, 2).parts}) > 1
+    assert len({part.bucket for part in plan_of(tmp_path / "farm", job, 2).parts}) > 1
     assert "noisy.R" in pixels(shot.output(2))
-    same_bits(shot, tmp_path, job, 2)
+    same_bits(shot, tmp_path / "farm", job, 2, tmp_path)
 
 
 def test_killed_workers_change_no_bit(
