@@ -1,7 +1,9 @@
 """The house's rules that a reviewer would otherwise have to keep in mind."""
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 
 def test_the_service_needs_neither_worker_nor_core() -> None:
@@ -32,3 +34,21 @@ main()
     assert ended.returncode == 1
     assert "pip install" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_nothing_that_a_client_sends_can_become_code() -> None:
+    """No shell, no eval, no pickle from afar: service and worker know none of them."""
+    house = Path(__file__).parents[1]
+    barred = {"pickle", "marshal", "shelve", "dill", "eval", "exec", "system", "popen", "shell"}
+    for file in [*house.glob("service/**/*.py"), *house.glob("worker/**/*.py")]:
+        for node in ast.walk(ast.parse(file.read_text())):
+            match node:
+                case ast.Import(names=names):
+                    used = {name.name.split(".")[0] for name in names}
+                case ast.ImportFrom(module=str(module)):
+                    used = {module.split(".")[0]}
+                case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), keywords=keywords):
+                    used = {name, *(word.arg or "" for word in keywords)}
+                case _:
+                    continue
+            assert not used & barred, f"{file}:{node.lineno}"

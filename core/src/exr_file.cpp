@@ -1,6 +1,7 @@
 #include "exr_file.h"
 
 #include "error.h"
+#include "printable.h"
 
 #include <OpenEXR/ImfChannelList.h>
 #include <OpenEXR/ImfFloatAttribute.h>
@@ -54,9 +55,12 @@ void set_attribute(Imf::Header& header, const std::string& name, const HeaderVal
 /// data.
 template <class Sample>
 char* origin_of(Sample* first, const Bucket& window) {
-    const std::ptrdiff_t offset = std::ptrdiff_t{window.y0} * window.width() + window.x0;
-    return reinterpret_cast<char*>(reinterpret_cast<std::intptr_t>(first) -
-                                   offset * static_cast<std::ptrdiff_t>(sizeof(Sample)));
+    // Unsigned, so that an origin far away wraps around and back.
+    const std::uintptr_t offset =
+        static_cast<std::uintptr_t>(window.y0) * static_cast<std::uintptr_t>(window.width()) +
+        static_cast<std::uintptr_t>(window.x0);
+    return reinterpret_cast<char*>(reinterpret_cast<std::uintptr_t>(first) -
+                                   offset * sizeof(Sample));
 }
 
 template <class Sample>
@@ -104,8 +108,34 @@ void write_parts(const std::string& path, const LayeredImage& image, int width, 
     }
 }
 
-void sync_to_disk(const std::string& path) {
-    const int file = ::open(path.c_str(), O_RDONLY);
+/// A file that was not there before: no link that somebody laid in its place is followed.
+class NewFile {
+  public:
+    explicit NewFile(const std::string& path) {
+        constexpr int flags = O_RDWR | O_CREAT | O_EXCL | O_NOFOLLOW | O_CLOEXEC;
+        file_ = ::open(path.c_str(), flags, 0666);
+        if (file_ < 0 && errno == EEXIST) {  // left by an earlier process of our number
+            ::unlink(path.c_str());
+            file_ = ::open(path.c_str(), flags, 0666);
+        }
+        if (file_ < 0) throw std::runtime_error(std::strerror(errno));
+    }
+    NewFile(const NewFile&) = delete;
+    NewFile& operator=(const NewFile&) = delete;
+    ~NewFile() { ::close(file_); }
+
+    /// Leads to this very file.
+    std::string location() const { return "/proc/self/fd/" + std::to_string(file_); }
+    void sync() const {
+        if (::fsync(file_) != 0) throw std::runtime_error(std::strerror(errno));
+    }
+
+  private:
+    int file_;
+};
+
+void sync_folder(const std::string& path) {
+    const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
     const bool synced = file >= 0 && ::fsync(file) == 0;
     const int reason = errno;
     if (file >= 0) ::close(file);
@@ -131,10 +161,11 @@ void write_exr(const std::string& path, const LayeredImage& image, int width, in
                const Header& header) {
     const std::string temporary = path + "." + std::to_string(::getpid()) + ".tmp";
     try {
-        write_parts(temporary, image, width, height, half, header);
-        sync_to_disk(temporary);
+        const NewFile file(temporary);
+        write_parts(file.location(), image, width, height, half, header);
+        file.sync();
         std::filesystem::rename(temporary, path);
-        sync_to_disk(std::filesystem::absolute(path).parent_path().string());
+        sync_folder(std::filesystem::absolute(path).parent_path().string());
     } catch (const std::exception& error) {
         std::error_code ignored;
         std::filesystem::remove(temporary, ignored);
@@ -163,11 +194,12 @@ ExrFile read_exr(const std::string& path) {
             if (names != channels || header.dataWindow() != data)
                 throw InputError("its parts differ in channels or size");
         }
-        // Deflate packs no tighter than this: a damaged header must not claim more memory.
-        constexpr std::uintmax_t tightest = 1032;
-        const std::uintmax_t least =
-            window.pixels() * channels.size() * looks.size() * sizeof(::half);
-        if (least / tightest > std::filesystem::file_size(path))
+        // Deflate packs no tighter than this: a damaged header must not claim more memory. In
+        // doubles, for its claim may be beyond all integers.
+        constexpr double tightest = 1032.0;
+        const double least = static_cast<double>(window.pixels() * sizeof(::half)) *
+                             static_cast<double>(channels.size() * looks.size());
+        if (least / tightest > static_cast<double>(std::filesystem::file_size(path)))
             throw InputError("it is too short for its size");
         result.image = LayeredImage(window, looks, channels);
         for (int p = 0; p < file.parts(); ++p) {
@@ -188,7 +220,8 @@ ExrFile read_exr(const std::string& path) {
         }
         return result;
     } catch (const std::exception& error) {
-        throw InputError(path + ": cannot be read as an EXR image (" + error.what() + ")");
+        throw InputError(path + ": cannot be read as an EXR image (" + printable(error.what()) +
+                         ")");
     }
 }
 

@@ -1,6 +1,7 @@
 #include "texture.h"
 
 #include "error.h"
+#include "printable.h"
 
 #include <dlfcn.h>
 
@@ -14,7 +15,7 @@ Texture read_texture(const std::string& path) {
     Texture texture;
     std::string trouble;
     read(path, texture, trouble);
-    if (!trouble.empty()) throw InputError(path + ": " + trouble);
+    if (!trouble.empty()) throw InputError(path + ": " + printable(trouble));
     return texture;
 }
 

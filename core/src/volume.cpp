@@ -2,8 +2,9 @@
 
 #include "brick_tree_builder.h"
 #include "error.h"
+#include "printable.h"
+#include "vdb_reader.h"
 
-#include <openvdb/io/File.h>
 #include <openvdb/tools/LevelSetUtil.h>
 
 #include <chrono>
@@ -14,38 +15,20 @@ namespace pileus {
 
 namespace {
 
-/// What a file holds, for the messages: "density (float), v (vec3s)".
-std::string listing(openvdb::io::File& file) {
-    std::string text;
-    for (auto name = file.beginName(); name != file.endName(); ++name) {
-        const auto grid = file.readGridMetadata(*name);
-        text += (text.empty() ? "" : ", ") + ('"' + *name + '"') + " (" + grid->valueType() + ")";
-    }
-    return text.empty() ? "no grid at all" : text;
-}
-
-std::string unique_name(openvdb::io::File& file, const std::string& wanted) {
-    for (auto name = file.beginName(); name != file.endName(); ++name) {
-        if (*name == wanted || *name == wanted + "[0]") return *name;
-    }
-    throw InputError("has no grid \"" + wanted + "\"; it holds " + listing(file));
-}
-
 openvdb::GridBase::Ptr read_grid(const std::string& path, const std::string& name) {
-    openvdb::io::File file(path);
-    file.open(/*delayLoad=*/false);
-    const std::string unique = unique_name(file, name);
-    const auto metadata = file.readGridMetadata(unique);
-    if (!metadata->isType<openvdb::FloatGrid>() && !metadata->isType<openvdb::DoubleGrid>()) {
-        throw InputError("grid \"" + name + "\" is of type " + metadata->type() +
+    VdbReader file(path);
+    const auto base = file.read(name, [&](const openvdb::GridBase& grid) {
+        if (grid.isType<openvdb::FloatGrid>() || grid.isType<openvdb::DoubleGrid>()) return;
+        throw InputError("grid \"" + name + "\" is of type " + grid.type() +
                          ", and a density must be float or double; the file holds " +
-                         listing(file));
-    }
-    if (!metadata->transform().isLinear()) {
+                         file.listing());
+    });
+    if (!base) throw InputError("has no grid \"" + name + "\"; it holds " + file.listing());
+    if (!base->transform().isLinear()) {
         throw InputError("grid \"" + name +
                          "\" has a frustum transform; resample it into a linear one");
     }
-    return file.readGrid(unique);
+    return base;
 }
 
 Imath::M44d to_imath(const openvdb::math::Mat4d& m) {
@@ -71,11 +54,14 @@ Volume::Volume(const std::string& path, const std::string& grid) : path_(path), 
             take(*openvdb::gridPtrCast<openvdb::DoubleGrid>(base));
         }
     } catch (const InputError& error) {
-        throw InputError(path + ": " + error.what());
+        throw InputError(path + ": " + printable(error.what()));
+    } catch (const std::ios_base::failure&) {
+        throw InputError(path + ": cannot be read as OpenVDB (it is damaged, or ends amid its " +
+                         "grids); write the cache again");
     } catch (const TooWide& error) {
         throw InputError(path + ": grid \"" + grid + "\" " + error.what());
     } catch (const std::exception& error) {  // OpenVDB's own, and the library's below it
-        throw InputError(path + ": cannot be read as OpenVDB (" + error.what() +
+        throw InputError(path + ": cannot be read as OpenVDB (" + printable(error.what()) +
                          "); write the cache again");
     }
     load_seconds_ = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

@@ -3,8 +3,10 @@
 #include "volume.h"
 
 #include "error.h"
+#include "printable.h"
 #include "support.h"
 
+#include <openvdb/io/Stream.h>
 #include <openvdb/points/PointConversion.h>
 #include <openvdb/tools/LevelSetSphere.h>
 
@@ -90,6 +92,25 @@ TEST_F(VolumeTest, TakesUnnamedGridsAndTheNthOfOneName) {
         test::write_grids(folder_.path("two.vdb"), {dot("", 0.5f), dot("", 0.25f)});
     EXPECT_EQ(at(Volume(two, ""), Vec3d(1, 2, 3)), 0.5f);
     EXPECT_EQ(at(Volume(two, "[1]"), Vec3d(1, 2, 3)), 0.25f);
+}
+
+TEST_F(VolumeTest, TakesInstancesAndFilesWrittenAsStreams) {
+    const auto first = dot("density", 0.5f);
+    const auto second = FloatGrid::create(first->treePtr());
+    second->setName("again");
+    second->setTransform(Transform::createLinearTransform(2.0));
+    const std::string path = write({first, second});  // the tree is in the file once
+    EXPECT_EQ(at(Volume(path, "density"), Vec3d(1, 2, 3)), 0.5f);
+    EXPECT_EQ(at(Volume(path, "again"), Vec3d(2, 4, 6)), 0.5f);
+
+    const std::string streamed = folder_.path("streamed.vdb");
+    {
+        std::ofstream out(streamed, std::ios::binary);
+        openvdb::io::Stream(out).write(openvdb::GridCPtrVec{dot("other", 0.25f), first, second});
+    }
+    EXPECT_EQ(at(Volume(streamed, "density"), Vec3d(1, 2, 3)), 0.5f);
+    EXPECT_EQ(at(Volume(streamed, "other"), Vec3d(1, 2, 3)), 0.25f);
+    EXPECT_EQ(at(Volume(streamed, "again"), Vec3d(2, 4, 6)), 0.5f);
 }
 
 struct Placement {
@@ -280,6 +301,32 @@ TEST_F(VolumeTest, RefusesFilesThatAreNotWhole) {
             << bytes.str().substr(0, bytes.str().size() * tenth / 10);
         EXPECT_NE(refusal(cut, ""), "") << tenth;
     }
+}
+
+TEST_F(VolumeTest, RefusesCountsBeyondTheFileAtOnce) {
+    const std::string whole = write({dot("density", 1.0f)});
+    std::ostringstream bytes;
+    bytes << std::ifstream(whole, std::ios::binary).rdbuf();
+    // OpenVDB itself reads nothing, for minutes, where a count is larger than its file.
+    for (std::size_t place = 0; place + 4 < bytes.str().size(); place += 3) {
+        std::string spoiled = bytes.str();
+        spoiled.replace(place, 4, "\xff\xff\xff\x0f");
+        const std::string path = folder_.path("spoiled.vdb");
+        std::ofstream(path, std::ios::binary) << spoiled;
+        try {
+            const Volume volume(path, "density");
+        } catch (const InputError& error) {
+            EXPECT_FALSE(holds(error.what(), "\n"));
+        }
+    }
+}
+
+TEST(PrintableTest, IsOneLineOfUtf8ThatNoTerminalObeys) {
+    EXPECT_EQ(printable("a.vdb: d\u00e9j\u00e0 \u96f2 \U0001F300"),
+              "a.vdb: d\u00e9j\u00e0 \u96f2 \U0001F300");
+    EXPECT_EQ(printable("a\nb\x1b[31m\x7f"), "a\\x0ab\\x1b[31m\\x7f");
+    EXPECT_EQ(printable("\xff\xc3(\xe2\x82"), "\\xff\\xc3(\\xe2\\x82");
+    EXPECT_EQ(printable("\xed\xa0\x80\xc0\xaf"), "\\xed\\xa0\\x80\\xc0\\xaf");
 }
 
 }  // namespace

@@ -25,6 +25,7 @@ from pileus_service.store import Store
 from pileus_worker.caches import Caches
 from pileus_worker.paths import NOWHERE_ELSE
 from pileus_worker.tasks import Work
+from render_fixtures import camera_around, make_scene
 
 
 @pytest.fixture
@@ -296,3 +297,21 @@ def test_a_task_whose_files_are_swapped_after_its_check_reads_and_writes_none_ou
     run(Kind.RENDER, planned.tasks - 1)
     run(Kind.MERGE)
     assert (tmp_path / "out" / "test.0001.exr").stat().st_size > 0
+
+
+def test_a_link_laid_in_the_place_of_a_temporary_file_is_not_followed(
+    root: Path, outside: Path
+) -> None:
+    """Whoever may write in the folder of an image can guess the name that it first has."""
+    core.make_cloud(str(root / "a.vdb"), frame=1, frames=1, resolution=16)
+    volume = core.Volume(str(root / "a.vdb"))
+    dome = core.DomeLight(radiance=(1, 1, 1), texture="")
+    scene = make_scene(volume, camera_around(volume), [dome], extinction=1.0, size=4)
+    transport = core.Transport(method="single", max_bounces=1, looks=[core.Look(name="a")])
+    part = core.render(scene, transport, bucket=(0, 0, 4, 4), samples=(0, 1), seed=1, frame=1)
+    trap = root / f"a.exr.{os.getpid()}.tmp"
+    trap.symlink_to(outside / "file")
+    part.write(str(root / "a.exr"), "identity")
+    assert (outside / "file").read_text() == "outside"
+    assert core.Partial.read(str(root / "a.exr")).identity == "identity"
+    assert not trap.is_symlink()

@@ -1,0 +1,83 @@
+"""Mutated caches, images and shots: each ends in an image or in one line, within the limits, and
+costs no worker. A few hundred here, 10,000 in the slow tier."""
+
+import random
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hostile import Reader, hostile_files, mutated, seeds
+from pileus_service.client import Client
+from pileus_service.shot import Shot
+from pileus_worker.embedded import embedded_farm
+
+
+@pytest.fixture
+def reader() -> Iterator[Reader]:
+    reader = Reader()
+    yield reader
+    reader.close()
+
+
+def look_through(reader: Reader, folder: Path, suffix: str, count: int, seed: int) -> None:
+    """Reads mutants; what is said of each must be one line, and nothing may end the process."""
+    told: Counter[str] = Counter()
+    for number, path, _ in hostile_files(folder, suffix, count, seed):
+        outcome = reader.read(path)
+        told[outcome.how] += 1
+        assert outcome.how in ("ok", "refused", "memory"), f"mutant {number} of {seed}: {outcome}"
+        if outcome.how == "refused":
+            assert outcome.line.isprintable(), outcome.line
+            assert len(outcome.line) < 2000
+    # Mutants that all fail in the first bytes would test little.
+    assert told["refused"] > count // 20
+    assert told["ok"] > 0, told
+
+
+@pytest.mark.parametrize(("suffix", "count"), [(".vdb", 100), (".exr", 150), (".toml", 150)])
+def test_a_mutant_is_read_or_refused_in_one_line(
+    reader: Reader, tmp_path: Path, suffix: str, count: int
+) -> None:
+    look_through(reader, tmp_path, suffix, count, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10, 20))
+@pytest.mark.parametrize(("suffix", "count"), [(".vdb", 400), (".exr", 400), (".toml", 200)])
+def test_ten_thousand_mutants(
+    reader: Reader, tmp_path: Path, suffix: str, count: int, seed: int
+) -> None:
+    look_through(reader, tmp_path, suffix, count, seed)
+
+
+@pytest.mark.parametrize("frames", [8, pytest.param(60, marks=pytest.mark.slow)])
+def test_a_farm_on_hostile_caches_loses_no_worker(
+    tmp_path: Path, shot: dict[str, Any], frames: int
+) -> None:
+    """A sequence of mutants: each frame is done or says why not, by the workers of the start."""
+
+    (tmp_path / "caches").mkdir()
+    right = seeds(tmp_path)[".vdb"]
+    for number in range(1, frames + 1):
+        dice = random.Random(f"farm.{number}")
+        data = right[0] if number == 1 else mutated(right[0], right, dice)
+        (tmp_path / "caches" / f"cloud.{number:04d}.vdb").write_bytes(data)
+    shot |= {"frames": f"1-{frames}", "sampling": {"samples": 1}}
+    shot["image"] |= {"width": 8, "height": 8}
+    with (
+        embedded_farm(tmp_path / "farm", [tmp_path], 2, "127.0.0.1:0") as farm,
+        Client(farm.url) as client,
+    ):
+        while len(workers := {each.name for each in client.workers() if each.alive}) < 2:
+            pass
+        job = client.submit(Shot.model_validate(shot)).job.id
+        *_, view = client.watch(job)
+        assert view.frames_done + view.frames_failed == frames
+        for frame in client.frames(job):
+            assert frame.state in ("done", "failed")
+            assert frame.state == "done" or (frame.reason and frame.reason.isprintable())
+            assert frame.frame != 1 or frame.state == "done"
+        assert {each.name for each in client.workers() if each.alive} == workers
