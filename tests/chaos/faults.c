@@ -18,7 +18,15 @@
 
 static void befall(const char* path) {
     const char *file = getenv("FAULT_FILE"), *fault = getenv("FAULT");
-    if (!path || !file || !fault || strlen(path) < strlen(file)) return;
+    char real[4096];
+    if (!path || !file || !fault) return;
+    /* What was opened already without being read, to be sure that no link is followed. */
+    const ssize_t size = strncmp(path, "/proc/", 6) ? -1 : readlink(path, real, sizeof real - 1);
+    if (size >= 0) {
+        real[size] = 0;
+        path = real;
+    }
+    if (strlen(path) < strlen(file)) return;
     if (strcmp(path + strlen(path) - strlen(file), file) != 0) return;
     if (strcmp(fault, "crash") == 0) raise(SIGSEGV);
     if (strcmp(fault, "hang") == 0)

@@ -1,5 +1,6 @@
 """Workers that leave: told to, and cut off."""
 
+import json
 import os
 import signal
 import subprocess
@@ -71,8 +72,10 @@ def test_a_drained_worker_finishes_and_rests(cached_shot: Shot, tmp_path: Path) 
         job = farm.client.submit(with_samples(cached_shot, 100)).job.id
         *_, view = farm.client.watch(job)
         assert view.state == "done"
-        told = (tmp_path / "workers.log").read_text()
-        assert "plan, attempt" in told
+        told = [json.loads(line) for line in (tmp_path / "workers.log").read_text().splitlines()]
+        at_work = {line["worker"] for line in told if line["event"] == "begun"}
+        assert at_work
+        assert name not in at_work
         [drained] = [worker for worker in farm.queue.workers() if worker.name == name]
         assert drained.aside == "drained"
         farm.client.drain(name, undo=True)
