@@ -22,7 +22,8 @@ def plan_of(data: Path, job: str, frame: int) -> Plan:
 def rendered_here(shot: Shot, plan: Plan) -> core.Frame:
     """What a farm must write, bit for bit: the plan's parts, rendered one by one."""
     volume = core.Volume(plan.cache.path, shot.volumes[0].density)
-    view, transport = scene.make_scene(shot, plan.frame, volume), scene.make_transport(shot)
+    view = scene.make_scene(shot, plan.frame, volume)
+    transport = scene.make_transport(shot, plan.transport)
     samples = shot.sampling.samples
     buckets = [*dict.fromkeys(part.bucket for part in plan.parts), *plan.empty]
     size = (shot.image.width, shot.image.height)

@@ -20,7 +20,7 @@ from tenacity import Retrying, retry_if_exception_type, stop_after_delay, wait_f
 from pileus_service.client import Client
 from pileus_service.errors import FarmError
 from pileus_service.jobs import JobView
-from pileus_service.shot import Shot
+from pileus_service.shot import Sampling, Shot, Transport
 from pileus_service.store import Store
 from pileus_worker.embedded import EmbeddedFarm, embedded_farm
 from serial_render import pixels, plan_of, same_bits
@@ -116,6 +116,29 @@ def test_the_farm_denoises_whole_frames(client: Client, real_shot: Shot, tmp_pat
     assert len({part.bucket for part in plan_of(tmp_path / "farm", job, 2).parts}) > 1
     assert "noisy.R" in pixels(shot.output(2))
     same_bits(shot, tmp_path / "farm", job, 2, tmp_path)
+
+
+def test_auto_decides_and_samples_in_the_farm_as_here(
+    client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    shot = real_shot.model_copy(
+        update={
+            "transport": Transport(method="auto"),
+            "sampling": Sampling(samples=512, tolerance=0.1, seed=7),
+        }
+    )
+    finish(client, client.submit(shot).job.id)
+    file = tmp_path / "shot.json"
+    file.write_text(shot.model_dump_json())
+    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
+    ended = subprocess.run(command, check=True, capture_output=True, text=True)
+    for report in json.loads(ended.stdout)["frames"]:
+        assert report["method"] == "similarity"
+        assert report["error"] <= 0.1
+        assert 4 <= report["samples"] < 512
+        farm = pixels(shot.output(report["frame"]))
+        for name, values in pixels(Path(report["file"])).items():
+            np.testing.assert_array_equal(farm[name], values, name)
 
 
 def test_killed_workers_change_no_bit(

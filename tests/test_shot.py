@@ -89,7 +89,9 @@ def test_camera_keys_are_linear_and_hold_at_the_ends(shot_file: Path) -> None:
     [
         ("sampling.sample=4", "sampling", "did you mean 'samples'?"),
         ("colour=1", "", "unknown key 'colour'"),
-        ("sampling.tolerance=0.1", "sampling", "unknown key 'tolerance'"),
+        ("sampling.tolerance=0", "sampling.tolerance = 0", "greater than or equal to 0.0001"),
+        ("transport.method=auto", "", "give sampling.tolerance"),
+        ("transport.reduce_from=0", "transport.reduce_from = 0", "greater than or equal to 1"),
         ("sampling.samples=0", "sampling.samples = 0", "greater than or equal to 1"),
         ("sampling.seed=-1", "sampling.seed", "greater than or equal to 0"),
         ("image.width=1000000000", "image.width = 1000000000", "less than or equal to 65536"),

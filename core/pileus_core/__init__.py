@@ -19,6 +19,7 @@ from ._core import (
     make_whitewater,
     read_image,
     render,
+    render_until,
 )
 
 __all__ = [
@@ -40,4 +41,5 @@ __all__ = [
     "make_whitewater",
     "read_image",
     "render",
+    "render_until",
 ]

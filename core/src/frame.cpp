@@ -3,6 +3,7 @@
 #include "error.h"
 
 #include <algorithm>
+#include <cmath>
 
 namespace pileus {
 
@@ -19,12 +20,12 @@ std::string text(const SampleRange& range) {
 
 }  // namespace
 
-Frame::Frame(int width, int height, std::vector<std::pair<Bucket, int>> plan)
+Frame::Frame(int width, int height, std::vector<std::pair<Bucket, std::optional<int>>> plan)
     : width_(width), height_(height) {
     std::vector<bool> covered(static_cast<std::size_t>(width) * static_cast<std::size_t>(height));
     for (const auto& [bucket, samples] : plan) {
         if (bucket.x0 < 0 || bucket.y0 < 0 || bucket.x1 > width || bucket.y1 > height ||
-            bucket.width() < 1 || bucket.height() < 1 || samples < 1) {
+            bucket.width() < 1 || bucket.height() < 1 || samples.value_or(1) < 1) {
             throw InputError("the plan's " + text(bucket) + " is empty or lies outside the image");
         }
         for (int y = bucket.y0; y < bucket.y1; ++y) {
@@ -60,11 +61,12 @@ void Frame::add(const Partial& partial) {
                          " is of another frame (identity, looks or orders differ)");
     }
     const int reached = tile->partial.samples.last;
+    if (!tile->wanted) tile->wanted = partial.samples.last;
     if (partial.samples.count() < 1 || partial.samples.first != reached ||
-        partial.samples.last > tile->wanted) {
+        partial.samples.last > *tile->wanted) {
         throw InputError(text(window) + ": " + text(partial.samples) + " does not follow the " +
                          std::to_string(reached) + " samples that are there, of " +
-                         std::to_string(tile->wanted));
+                         std::to_string(*tile->wanted));
     }
     if (reached == 0) {
         tile->partial = partial;
@@ -72,6 +74,7 @@ void Frame::add(const Partial& partial) {
         tile->partial.pool(partial);
     }
     if (tile->partial.samples.last == tile->wanted) {
+        tile->error = tile->partial.relative_error();
         place(*tile);
         tile->partial.image = {};
     }
@@ -91,12 +94,35 @@ void Frame::place(const Tile& tile) {
     }
 }
 
+double Frame::mean_samples() const {
+    double samples = 0.0, pixels = 0.0;
+    for (const Tile& tile : tiles_) {
+        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
+        const auto area = static_cast<double>(tile.bucket.pixels());
+        samples += *tile.wanted * area;
+        pixels += area;
+    }
+    return pixels > 0.0 ? samples / pixels : 0.0;
+}
+
+double Frame::relative_error() const {
+    double squares = 0.0, pixels = 0.0;
+    for (const Tile& tile : tiles_) {
+        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
+        const auto area = static_cast<double>(tile.bucket.pixels());
+        squares += tile.error * tile.error * area;
+        pixels += area;
+    }
+    return pixels > 0.0 ? std::sqrt(squares / pixels) : 0.0;
+}
+
 void Frame::require_complete() const {
     for (const Tile& tile : tiles_) {
+        if (!tile.wanted) throw InputError(text(tile.bucket) + " has no samples; render it");
         if (tile.partial.samples.last == tile.wanted) continue;
         throw InputError(text(tile.bucket) + " has " + std::to_string(tile.partial.samples.last) +
-                         " of its " + std::to_string(tile.wanted) + " samples; render " +
-                         text(SampleRange{tile.partial.samples.last, tile.wanted}));
+                         " of its " + std::to_string(*tile.wanted) + " samples; render " +
+                         text(SampleRange{tile.partial.samples.last, *tile.wanted}));
     }
 }
 

@@ -3,6 +3,7 @@
 
 #include "partial.h"
 
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -11,9 +12,9 @@ namespace pileus {
 
 class Frame {
   public:
-    /// The buckets and how many samples each must reach. Throws InputError unless they tile the
-    /// image exactly.
-    Frame(int width, int height, std::vector<std::pair<Bucket, int>> plan);
+    /// The buckets and how many samples each must reach; nothing: as many as its one partial has.
+    /// Throws InputError unless they tile the image exactly.
+    Frame(int width, int height, std::vector<std::pair<Bucket, std::optional<int>>> plan);
 
     /// Takes the next samples of a bucket; those of one bucket must come in order. Throws
     /// InputError for a partial that is not of the plan, overlaps what is there, leaves a gap, or
@@ -31,11 +32,18 @@ class Frame {
 
     const LayeredImage& image() const { return image_; }
 
+    /// Samples a pixel, over those that have all of theirs.
+    double mean_samples() const;
+
+    /// The RMS relative error of all pixels that have all of their samples: see `Partial`.
+    double relative_error() const;
+
   private:
     struct Tile {
         Bucket bucket;
-        int wanted;
-        Partial partial;  // what has come so far
+        std::optional<int> wanted;
+        Partial partial;     // what has come so far
+        double error = 0.0;  // of the whole of it
     };
 
     void require_complete() const;

@@ -283,6 +283,8 @@ NB_MODULE(_core, m) {
         .def_prop_ro("looks", [](const Partial& p) { return p.image.looks(); })
         .def_ro("identity", &Partial::identity)
         .def_ro("bounded_paths", &Partial::bounded_paths, "Paths that the bound on work has ended.")
+        .def("relative_error", &Partial::relative_error,
+             "The RMS relative error of its pixels, from their variances.")
         .def(
             "channels",
             [](const Partial& p, const std::string& look) {
@@ -304,14 +306,16 @@ NB_MODULE(_core, m) {
         .def(
             "__init__",
             [](Frame* self, int width, int height,
-               const std::vector<std::pair<BucketTuple, int>>& plan) {
-                std::vector<std::pair<Bucket, int>> buckets;
+               const std::vector<std::pair<BucketTuple, std::optional<int>>>& plan) {
+                std::vector<std::pair<Bucket, std::optional<int>>> buckets;
                 for (const auto& [bucket, samples] : plan)
                     buckets.emplace_back(to_bucket(bucket), samples);
                 new (self) Frame(width, height, std::move(buckets));
             },
             "width"_a, "height"_a, "plan"_a,
-            "The plan: each bucket with the samples it must reach. Raises InputError.")
+            "The plan: each bucket with the samples it must reach; None: as many as its one "
+            "partial "
+            "has. Raises InputError.")
         .def("add", &Frame::add, "partial"_a, nb::call_guard<nb::gil_scoped_release>(),
              "Takes a bucket's next samples. Raises InputError for any that overlap, leave a gap "
              "or do not belong.")
@@ -325,6 +329,10 @@ NB_MODULE(_core, m) {
             "path"_a, nb::kw_only(), "half"_a = false, "header"_a = PythonHeader{},
             "Whole or not at all. Raises InputError where samples are missing, RuntimeError where "
             "it cannot be written.")
+        .def_prop_ro("mean_samples", &Frame::mean_samples,
+                     "Samples a pixel, over those that have all of theirs.")
+        .def("relative_error", &Frame::relative_error,
+             "The RMS relative error of the pixels, from their variances.")
         .def(
             "set_denoised",
             [](Frame& frame,
@@ -363,6 +371,22 @@ NB_MODULE(_core, m) {
         "orders"_a = false, "threads"_a = 0, "control"_a.none() = nb::none(),
         "Renders a bucket (x0, y0, x1, y1) over the samples [first, last). Raises InputError, "
         "Cancelled.");
+
+    m.def(
+        "render_until",
+        [](const Scene& scene, const Transport& transport, const BucketTuple& bucket, int samples,
+           double tolerance, std::uint64_t seed, int frame, bool orders, int threads,
+           Control* control) {
+            Control own;
+            const RenderTask task{to_bucket(bucket), {0, samples}, seed, frame, orders};
+            const nb::gil_scoped_release release;
+            return render_until(scene, transport, task, tolerance, threads,
+                                control ? *control : own);
+        },
+        "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "tolerance"_a, "seed"_a,
+        "frame"_a, "orders"_a = false, "threads"_a = 0, "control"_a.none() = nb::none(),
+        "Renders a bucket until the RMS relative error of its pixels is at most `tolerance`, with "
+        "at most `samples` a pixel. Raises InputError, Cancelled.");
 
     m.def(
         "read_image",

@@ -3,7 +3,9 @@
 #include "error.h"
 #include "random.h"
 
+#include <algorithm>
 #include <bit>
+#include <cmath>
 #include <cstdio>
 #include <limits>
 
@@ -108,6 +110,38 @@ Partial Partial::read(const std::string& path) {
         throw InputError(path + ": its pixels are not those that were written; render it again");
     }
     return partial;
+}
+
+double Partial::relative_error() const {
+    // A pixel that has missed its rare bright paths has too small a variance, and one that has met
+    // them too large a mean: pixel by pixel the ratio would be too small. Blocks even that out.
+    constexpr int block = 4;
+    const Bucket& window = image.window();
+    double greatest = 0.0;
+    for (std::size_t look = 0; look < image.looks().size(); ++look) {
+        double sum = 0.0;
+        for (std::size_t c = 0; c < 3; ++c) {
+            const float* const mean = image.plane(look, r + c);
+            const float* const variance = image.plane(look, variance_r + c);
+            for (int y0 = 0; y0 < window.height(); y0 += block) {
+                for (int x0 = 0; x0 < window.width(); x0 += block) {
+                    const int y1 = std::min(y0 + block, window.height());
+                    const int x1 = std::min(x0 + block, window.width());
+                    double means = 0.0, variances = 0.0;
+                    for (int y = y0; y < y1; ++y) {
+                        for (int x = x0; x < x1; ++x) {
+                            means += mean[y * window.width() + x];
+                            variances += variance[y * window.width() + x];
+                        }
+                    }
+                    means /= (y1 - y0) * (x1 - x0);
+                    sum += variances / (means * means + 0.01);
+                }
+            }
+        }
+        greatest = std::max(greatest, sum / (3.0 * static_cast<double>(window.pixels())));
+    }
+    return std::sqrt(greatest);
 }
 
 void Partial::pool(const Partial& other) {

@@ -35,6 +35,11 @@ struct Partial {
     /// Throws InputError for a file that is truncated, altered or no partial.
     static Partial read(const std::string& path);
 
+    /// The RMS relative error of its pixels, from their variances, of the look where it is
+    /// greatest: the root of the mean over pixels and RGB of variance / (mean^2 + 0.01), with the
+    /// means of small blocks.
+    double relative_error() const;
+
     /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
     void pool(const Partial& other);
 };

@@ -7,6 +7,8 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
+#include <bit>
+
 namespace pileus {
 
 namespace {
@@ -159,6 +161,26 @@ Partial render(const Scene& scene, const Transport& transport, const RenderTask&
         });
     });
     partial.bounded_paths = bounded;
+    return partial;
+}
+
+Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
+                     double tolerance, int threads, Control& control) {
+    // The first round is long enough for a variance over the bucket; each later one adds half or a
+    // third, so that hardly more is taken than is needed, and a round's end splits no Sobol net
+    // into odd parts.
+    constexpr int first_round = 4;
+    if (!(tolerance > 0.0)) throw InputError("the tolerance must be positive");
+    RenderTask round = task;
+    round.samples = {0, std::min(first_round, task.samples.last)};
+    Partial partial = render(scene, transport, round, threads, control);
+    while (partial.samples.last < task.samples.last && partial.relative_error() > tolerance) {
+        const int taken = partial.samples.last;
+        const int next =
+            std::has_single_bit(static_cast<unsigned>(taken)) ? taken / 2 * 3 : taken / 3 * 4;
+        round.samples = {taken, std::min(next, task.samples.last)};
+        partial.pool(render(scene, transport, round, threads, control));
+    }
     return partial;
 }
 

@@ -34,4 +34,10 @@ struct RenderTask {
 Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
                Control& control);
 
+/// Renders the task in rounds of growing length until the pixels' RMS relative error, as their own
+/// variances tell it, is at most `tolerance` in every look, or all of the task's samples are taken.
+/// Samples begin at 0; the partial says how many there are, and they are those that `render` takes.
+Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
+                     double tolerance, int threads, Control& control);
+
 }  // namespace pileus

@@ -102,12 +102,24 @@ class Part(Record):
         return (x1 - x0) * (y1 - y0) * (self.samples[1] - self.samples[0])
 
 
+class Resolved(Record):
+    """The transport of a frame as it was decided, and why."""
+
+    method: str
+    max_bounces: int | None
+    reduce_from: int
+    # The RMS relative error at which a bucket takes no more samples; None takes them all.
+    noise: float | None = None
+    reason: str
+
+
 class Plan(Record):
     """How a frame is rendered: plan.json. The empty buckets are left to the merge."""
 
     frame: int
     identity: str
     cache: Cache
+    transport: Resolved
     parts: list[Part]
     empty: list[Bucket]
     begun: float

@@ -24,7 +24,7 @@ Number = Annotated[float, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Flag = Annotated[bool, Field(strict=True)]
 Vec3 = tuple[Number, Number, Number]
-Method = Literal["single", "contrast", "multiple", "density", "reference", "similarity"]
+Method = Literal["single", "contrast", "multiple", "density", "reference", "similarity", "auto"]
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Radiance = Annotated[Number, Field(ge=0, le=1e6)]
 Colour = tuple[Radiance, Radiance, Radiance]
@@ -33,7 +33,7 @@ FilePath = Annotated[str, Field(min_length=1, max_length=1024, pattern=r"^[^\x00
 MAX_PIXELS = 1 << 27
 MAX_VALUES = 1 << 32
 MAX_ORDERS = 64
-UNLIMITED = ("reference", "similarity")  # without max_bounces
+UNLIMITED = ("reference", "similarity", "auto")  # without max_bounces
 
 
 class Model(BaseModel):
@@ -230,10 +230,11 @@ class Transport(Model):
 
 
 class Sampling(Model):
-    """How many samples a pixel takes, and which."""
+    """How many samples a pixel takes, and which; with a tolerance, the most it may take."""
 
     samples: Whole = Field(ge=1, le=1 << 20)
     seed: Whole = Field(default=0, ge=0, lt=1 << 32)
+    tolerance: Number | None = Field(default=None, ge=1e-4, le=1)
 
 
 class Shot(Model):
@@ -271,6 +272,8 @@ class Shot(Model):
                 "put #### where the frame's number goes"
             )
         self._check_memory()
+        if self.transport.method == "auto" and self.sampling.tolerance is None:
+            raise ValueError("transport.method auto needs a goal; give sampling.tolerance, as 0.05")
         bounces = self.transport.max_bounces
         unlimited = bounces is None and self.transport.method in UNLIMITED
         if self.image.orders and (unlimited or (bounces or 0) > MAX_ORDERS):

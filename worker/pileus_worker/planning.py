@@ -10,6 +10,7 @@ from pileus_service.jobs import Bucket, Part
 
 SMALLEST = 32
 LARGEST = 512
+ADAPTIVE_EDGE = 64
 MAX_TASKS = 50_000
 PILOT_CELLS = 8
 PILOT_EDGE = 16
@@ -93,6 +94,15 @@ def cut(
         parts += [Part(bucket=bucket, samples=(bounds[i], bounds[i + 1])) for i in range(count)]
     touched_set = set(touched)
     return parts, [bucket for bucket in buckets if bucket not in touched_set]
+
+
+def even(scene: core.Scene, size: tuple[int, int], samples: int) -> tuple[list[Part], list[Bucket]]:
+    """Small buckets, each one part, for samples that end when a bucket's own error is met; and the
+    buckets that no ray of meets the volume. No timing has a say: the samples depend on them."""
+    buckets = tiles(*size, ADAPTIVE_EDGE)
+    touched = [bucket for bucket in buckets if scene.touches(bucket)]
+    empty = [bucket for bucket in buckets if not scene.touches(bucket)]
+    return [Part(bucket=bucket, samples=(0, samples)) for bucket in touched], empty
 
 
 def _seconds(bucket: Bucket, cost: Cost) -> float:

@@ -12,7 +12,7 @@ import pileus_core as core
 
 from pileus_service import __version__
 from pileus_service.frames import expand
-from pileus_service.jobs import Cache
+from pileus_service.jobs import Cache, Resolved
 from pileus_service.shot import DistantLight, DomeLight, Shot
 from pileus_worker.paths import NOWHERE_ELSE, PathMap
 
@@ -76,22 +76,19 @@ def _light(
         return core.DomeLight(radiance=light.radiance, texture=location)
 
 
-def make_transport(shot: Shot) -> core.Transport:
-    asked = shot.transport
-    looks = [core.Look(name=look.name, a=look.a, b=look.b, c=look.c) for look in asked.looks]
+def make_looks(shot: Shot) -> list[core.Look]:
+    return [
+        core.Look(name=look.name, a=look.a, b=look.b, c=look.c) for look in shot.transport.looks
+    ]
+
+
+def make_transport(shot: Shot, resolved: Resolved) -> core.Transport:
     return core.Transport(
-        method=asked.method,
-        max_bounces=asked.max_bounces,
-        looks=looks,
-        reduce_from=asked.reduce_from,
+        method=resolved.method,
+        max_bounces=resolved.max_bounces,
+        looks=make_looks(shot),
+        reduce_from=resolved.reduce_from,
     )
-
-
-def reason(shot: Shot) -> str:
-    """Why the transport is what it is."""
-    if shot.transport.max_bounces is None:
-        return "the shot names the method; the depth is the method's default"
-    return "the shot names the method and the depth"
 
 
 def identity(shot: Shot, frame: int, cache: Cache) -> str:
@@ -107,15 +104,10 @@ def identity(shot: Shot, frame: int, cache: Cache) -> str:
     return hashlib.sha256(json.dumps(pixels, sort_keys=True).encode()).hexdigest()
 
 
-def header(shot: Shot, frame: int, transport: core.Transport, seconds: float) -> Header:
+def header(shot: Shot, frame: int, resolved: Resolved, seconds: float) -> Header:
     """What a pipeline wants to know of an image."""
     camera = make_camera(shot, frame)
     rate = Fraction(shot.fps).limit_denominator(1001)
-    resolved = {
-        "method": shot.transport.method,
-        "max_bounces": transport.max_bounces,
-        "reason": reason(shot),
-    }
     return {
         "worldToCamera": camera.world_to_camera(),
         "worldToNDC": camera.world_to_ndc(shot.image.width, shot.image.height),
@@ -124,5 +116,5 @@ def header(shot: Shot, frame: int, transport: core.Transport, seconds: float) ->
         "software": f"Pileus {__version__}",
         "pileus.frame": str(frame),
         "pileus.shot": shot.model_dump_json(),
-        "pileus.transport": json.dumps(resolved),
+        "pileus.transport": resolved.model_dump_json(),
     }

@@ -22,13 +22,14 @@ from pileus_service.jobs import (
     Planned,
     Rendered,
     Replan,
+    Resolved,
     Result,
     Stale,
     Waiting,
 )
 from pileus_service.roots import Roots
 from pileus_service.store import FrameStore, Store, sync_folder
-from pileus_worker import planning, scene
+from pileus_worker import deciding, planning, scene
 from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.paths import PathMap
@@ -131,26 +132,59 @@ class Work:
     def _new_plan(self, cache: Cache, identity: str) -> Plan:
         begun = time.time()
         shot = self.job.shot
-        view, transport = self._scene(cache), scene.make_transport(shot)
+        view = self._scene(cache)
         size = (shot.image.width, shot.image.height)
+        samples = shot.sampling.samples
         with self._phase("plan"):
-            cost = planning.measure(
-                view,
-                transport,
-                size,
-                seed=shot.sampling.seed,
-                frame=self.frame,
-                threads=self.threads,
-                control=self.control,
-            )
-        parts, empty = planning.cut(view, cost, size, shot.sampling.samples, self.task_seconds)
+            resolved = self._resolve(cache)
+            if resolved.noise is not None:
+                parts, empty = planning.even(view, size, samples)
+            else:
+                cost = planning.measure(
+                    view,
+                    scene.make_transport(shot, resolved),
+                    size,
+                    seed=shot.sampling.seed,
+                    frame=self.frame,
+                    threads=self.threads,
+                    control=self.control,
+                )
+                parts, empty = planning.cut(view, cost, size, samples, self.task_seconds)
         return Plan(
             frame=self.frame,
             identity=identity,
             cache=cache,
+            transport=resolved,
             parts=parts,
             empty=empty,
             begun=begun,
+        )
+
+    def _resolve(self, cache: Cache) -> Resolved:
+        """This frame's transport; for `auto` in the light of that of the shot's first frame, which
+        is measured now unless its plan tells it."""
+        shot = self.job.shot
+        first = shot.frame_numbers[0]
+        earlier = None
+        if shot.transport.method == "auto" and first != self.frame:
+            plan = self.store.frame(self.job.id, first).plan()
+            earlier = (
+                self._decide(first, scene.cache_of(shot, first, self.paths), None)
+                if plan is None
+                else plan.transport
+            )
+        return self._decide(self.frame, cache, earlier)
+
+    def _decide(self, frame: int, cache: Cache, earlier: Resolved | None) -> Resolved:
+        shot = self.job.shot
+        return deciding.resolve(
+            self.paths.shot(shot),
+            frame,
+            lambda: self.caches.get(cache, shot.volumes[0].density),
+            threads=self.threads,
+            control=self.control,
+            earlier=earlier,
+            reading=self.roots.reading,
         )
 
     def _render(self, files: FrameStore, plan: Plan) -> Rendered:
@@ -162,7 +196,7 @@ class Work:
                 self._begin_next()
             # Only where the frame's folder is: a job that was removed leaves nothing behind.
             path.parent.mkdir(exist_ok=True)
-            partial = self._samples(view, part.bucket, part.samples)
+            partial = self._samples(view, plan, part.bucket, part.samples)
             with self._phase("write"):
                 partial.write(str(path), plan.identity)
             if files.done() is not None:
@@ -172,7 +206,7 @@ class Work:
     def _merge(self, files: FrameStore, plan: Plan) -> Merged:
         """Writes the image from the partials; those missing or damaged are to be made again."""
         shot = self.job.shot
-        samples = shot.sampling.samples
+        samples = shot.sampling.samples if plan.transport.noise is None else None
         buckets = [*dict.fromkeys(part.bucket for part in plan.parts), *plan.empty]
         frame = core.Frame(
             shot.image.width, shot.image.height, [(bucket, samples) for bucket in buckets]
@@ -196,25 +230,25 @@ class Work:
         with self._phase("denoise"):
             denoise(frame, shot, self.threads)
         with self._phase("write"):
-            self._write(files, frame, time.time() - plan.begun)
+            self._write(files, plan, frame)
         return Merged()
 
     def _empty_buckets(self, plan: Plan) -> Iterator[core.Partial]:
         if plan.empty:
             view = self._scene(plan.cache)
             for bucket in plan.empty:
-                yield self._samples(view, bucket, (0, self.job.shot.sampling.samples))
+                yield self._samples(view, plan, bucket, (0, self.job.shot.sampling.samples))
 
-    def _write(self, files: FrameStore, frame: core.Frame, seconds: float) -> None:
-        shot = self.job.shot
-        transport = scene.make_transport(shot)
+    def _write(self, files: FrameStore, plan: Plan, frame: core.Frame) -> None:
+        shot, resolved = self.job.shot, plan.transport
+        seconds = time.time() - plan.begun
         place = self.roots.writing(self.paths.shot(shot).output(self.frame))
         staging = self.roots.writing(self._staging / f"{os.getpid()}.exr")
         with place as location, staging as staged:
             frame.write(
                 staged,
                 half=shot.image.pixel_type == "half",
-                header=scene.header(shot, self.frame, transport, seconds),
+                header=scene.header(shot, self.frame, resolved, seconds),
             )
             self.permit()
             Path(staged).replace(location)
@@ -225,10 +259,10 @@ class Work:
                 frame=self.frame,
                 file=str(shot.output(self.frame)),
                 seconds=seconds,
-                samples=shot.sampling.samples,
-                method=shot.transport.method,
-                max_bounces=transport.max_bounces,
-                reason=scene.reason(shot),
+                samples=round(frame.mean_samples),
+                method=resolved.method,
+                max_bounces=resolved.max_bounces,
+                reason=resolved.reason,
             )
         )
         self._tidy(files)
@@ -282,17 +316,17 @@ class Work:
             raise
         return partial
 
-    def _samples(self, view: core.Scene, bucket: Bucket, samples: tuple[int, int]) -> core.Partial:
-        shot = self.job.shot
+    def _samples(
+        self, view: core.Scene, plan: Plan, bucket: Bucket, samples: tuple[int, int]
+    ) -> core.Partial:
         with self._phase("render"):
-            return core.render(
+            return deciding.render(
                 view,
-                scene.make_transport(shot),
+                self.job.shot,
+                plan.transport,
+                frame=self.frame,
                 bucket=bucket,
                 samples=samples,
-                seed=shot.sampling.seed,
-                frame=self.frame,
-                orders=shot.image.orders,
                 threads=self.threads,
                 control=self.control,
             )

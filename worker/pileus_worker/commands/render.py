@@ -11,10 +11,11 @@ from typing import Annotated, Any
 import pileus_core as core
 import typer
 
+from pileus_service.jobs import Resolved
 from pileus_service.progress import Display, Row, duration
 from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files, load_shot
-from pileus_worker import machine, scene
+from pileus_worker import deciding, machine, planning, scene
 from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.errors import plain_errors
@@ -57,9 +58,10 @@ class Renderer:
         self._threads = threads or machine.cores()
         self._display = display
         self._frames = shot.frame_numbers
-        self._transport = scene.make_transport(shot)
+        self._first: Resolved | None = None  # what was decided for the first frame
         self._caches = Caches(machine.cache_bytes())
         self._begun = time.monotonic()
+        self._pixels_done = 0
 
     def all_frames(self) -> list[dict[str, Any]]:
         return [self._frame(index, frame) for index, frame in enumerate(self._frames)]
@@ -68,55 +70,45 @@ class Renderer:
         shot, image = self._shot, self._shot.image
         begun = time.monotonic()
         grid = shot.volumes[0].density
-        cache = scene.cache_of(shot, number)
-        volume = self._caches.get(cache, grid)
+        volume = self._caches.get(scene.cache_of(shot, number), grid)
         for warning in volume.warnings:
             self._display.note(f"frame {number}: {warning}")
         if index + 1 < len(self._frames):
             self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
-        view = scene.make_scene(shot, number, volume)
         rendering = time.monotonic()
-        partial = self._samples(view, index, number)
+        resolved, frame = self._watched(index, number, volume)
         render_seconds = time.monotonic() - rendering
-        whole = (0, 0, image.width, image.height)
-        frame = core.Frame(image.width, image.height, [(whole, shot.sampling.samples)])
-        frame.add(partial)
         denoise(frame, shot, self._threads)
         output = shot.output(number)
         output.parent.mkdir(parents=True, exist_ok=True)
-        header = scene.header(shot, number, self._transport, render_seconds)
+        header = scene.header(shot, number, resolved, render_seconds)
         frame.write(str(output), half=image.pixel_type == "half", header=header)
         seconds = time.monotonic() - begun
         self._display.note(f"frame {number}: {output}, {duration(seconds)}")
+        error, noise = frame.relative_error(), resolved.noise
+        if noise is not None and error > noise:
+            self._display.note(
+                f"frame {number}: warning: noise of {error:.2%} is over the {noise:.2%} that the "
+                "tolerance leaves it; raise sampling.samples"
+            )
         return {
             "frame": number,
             "file": str(output),
             "seconds": seconds,
             "load_seconds": volume.load_seconds,
             "render_seconds": render_seconds,
-            "samples": shot.sampling.samples,
-            "method": shot.transport.method,
-            "max_bounces": self._transport.max_bounces,
-            "reason": scene.reason(shot),
+            "samples": round(frame.mean_samples),
+            "error": error,
+            "method": resolved.method,
+            "max_bounces": resolved.max_bounces,
+            "reason": resolved.reason,
         }
 
-    def _samples(self, view: core.Scene, index: int, number: int) -> core.Partial:
-        """All samples of a frame, with progress; a Ctrl-C stops the renderer's threads too."""
-        shot = self._shot
+    def _watched(self, index: int, number: int, volume: core.Volume) -> tuple[Resolved, core.Frame]:
+        """Renders with progress; a Ctrl-C stops the renderer's threads too."""
         control = core.Control()
         with ThreadPoolExecutor(1) as executor:
-            future = executor.submit(
-                core.render,
-                view,
-                self._transport,
-                bucket=(0, 0, shot.image.width, shot.image.height),
-                samples=(0, shot.sampling.samples),
-                seed=shot.sampling.seed,
-                frame=number,
-                orders=shot.image.orders,
-                threads=self._threads,
-                control=control,
-            )
+            future = executor.submit(self._render, number, volume, control)
             try:
                 while not wait([future], 0.1).done:
                     self._show(index, number, control.samples_done)
@@ -127,14 +119,55 @@ class Renderer:
                 raise
             return future.result()
 
+    def _render(
+        self, number: int, volume: core.Volume, control: core.Control
+    ) -> tuple[Resolved, core.Frame]:
+        shot, size = self._shot, (self._shot.image.width, self._shot.image.height)
+        self._pixels_done = 0
+        resolved = deciding.resolve(
+            shot,
+            number,
+            lambda: volume,
+            threads=self._threads,
+            control=control,
+            earlier=self._first,
+        )
+        self._first = self._first or resolved
+        view = scene.make_scene(shot, number, volume)
+        samples = shot.sampling.samples
+        adaptive = resolved.noise is not None
+        buckets = planning.tiles(*size, planning.ADAPTIVE_EDGE if adaptive else max(size))
+        frame = core.Frame(*size, [(each, None if adaptive else samples) for each in buckets])
+        for bucket in buckets:
+            frame.add(
+                deciding.render(
+                    view,
+                    shot,
+                    resolved,
+                    frame=number,
+                    bucket=bucket,
+                    samples=(0, samples),
+                    threads=self._threads,
+                    control=control,
+                )
+            )
+            self._pixels_done += (bucket[2] - bucket[0]) * (bucket[3] - bucket[1])
+        return resolved, frame
+
     def _show(self, index: int, number: int, samples: int) -> None:
-        image = self._shot.image
-        total = image.width * image.height * self._shot.sampling.samples
-        here = min(1.0, samples / total)
+        image, sampling = self._shot.image, self._shot.sampling
+        pixels = image.width * image.height
+        if sampling.tolerance is None:
+            total = pixels * sampling.samples
+            here = min(1.0, samples / total)
+            told = f"{samples / 1e6:.1f} of {total / 1e6:.1f} M samples"
+        else:
+            here = self._pixels_done / pixels
+            told = f"{samples / 1e6:.1f} M samples"
         all_done = (index + here) / len(self._frames)
         spent = time.monotonic() - self._begun
         left = duration(spent * (1 - all_done) / all_done) if all_done > 0 else "-"
         self._display.show(
             Row(self._shot.name, all_done, f"{index} of {len(self._frames)} frames, {left} left"),
-            Row(f"  frame {number}", here, f"{samples / 1e6:.1f} of {total / 1e6:.1f} M samples"),
+            Row(f"  frame {number}", here, told),
         )

@@ -1,0 +1,126 @@
+"""`auto`: its promise against a quiet truth, the model it takes, its calm along a sequence."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pileus_core as core
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pileus_service.shot import Shot
+from pileus_worker import deciding, planning, scene
+from pileus_worker.deciding import PILOT_ORDERS, Measure, decide
+
+SIZE = 48
+SEEDS = range(5)
+
+
+def auto(shot: dict[str, Any], cache: Path, tolerance: float, **volume: Any) -> Shot:
+    return Shot.model_validate(
+        shot
+        | {
+            "frames": "1",
+            "image": shot["image"] | {"width": SIZE, "height": SIZE},
+            "volumes": [shot["volumes"][0] | {"cache": str(cache)} | volume],
+            "transport": {"method": "auto"},
+            "sampling": {"samples": 4096, "tolerance": tolerance},
+        }
+    )
+
+
+def red(shot: Shot, volume: core.Volume, method: core.Transport, samples: int) -> Any:
+    partial = core.render(
+        scene.make_scene(shot, 1, volume),
+        method,
+        bucket=(0, 0, SIZE, SIZE),
+        samples=(0, samples),
+        seed=99,
+        frame=1,
+    )
+    return partial.channels("beauty")["R"].astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("volume", "tolerance", "method"),
+    [
+        pytest.param({"extinction": 60.0, "anisotropy": 0.85}, 0.1, "similarity", id="cumulus"),
+        pytest.param({"extinction": 0.3, "anisotropy": 0.6}, 0.05, "single", id="haze"),
+        pytest.param(
+            {"extinction": 20.0, "anisotropy": 0.0, "albedo": (0.8, 0.8, 0.8)},
+            0.1,
+            "reference",
+            id="absorbing",
+        ),
+    ],
+)
+def test_the_tolerance_is_kept_by_the_smallest_model(
+    shot: dict[str, Any],
+    tmp_path: Path,
+    volume: dict[str, Any],
+    tolerance: float,
+    method: str,
+) -> None:
+    cache = tmp_path / "cloud.vdb"
+    core.make_cloud(str(cache), frame=1, frames=3, resolution=48)
+    field = core.Volume(str(cache))
+    wanted = auto(shot, cache, tolerance, **volume)
+    truth = red(wanted, field, core.Transport(method="reference", looks=[_beauty()]), 1024)
+    within = 0
+    for seed in SEEDS:
+        sampling = wanted.sampling.model_copy(update={"seed": seed})
+        ours = wanted.model_copy(update={"sampling": sampling})
+        control = core.Control()
+        resolved = deciding.resolve(ours, 1, lambda: field, threads=0, control=control)
+        assert resolved.method == method, resolved.reason
+        buckets = planning.tiles(SIZE, SIZE, planning.ADAPTIVE_EDGE)
+        frame = core.Frame(SIZE, SIZE, [(bucket, None) for bucket in buckets])
+        for bucket in buckets:
+            frame.add(
+                deciding.render(
+                    scene.make_scene(ours, 1, field),
+                    ours,
+                    resolved,
+                    frame=1,
+                    bucket=bucket,
+                    samples=(0, 4096),
+                    threads=0,
+                    control=control,
+                )
+            )
+        image = frame.pixels("beauty")[..., 0]
+        error = math.sqrt(np.mean((image - truth) ** 2 / (truth**2 + 0.01)))
+        within += error <= tolerance
+    assert within == len(SEEDS)
+
+
+def _beauty() -> core.Look:
+    return core.Look(name="beauty")
+
+
+@given(st.lists(st.floats(0.96, 1.04), min_size=2, max_size=12))
+def test_a_measure_that_wavers_about_a_limit_flips_nothing(wavering: list[float]) -> None:
+    """Along a sequence the decision holds while the measure stays within a few per cent of where
+    one model gives way to the next, on either side."""
+    shot = Shot.model_validate(
+        {
+            "name": "wavering",
+            "frames": "1-9",
+            "image": {"width": 8, "height": 8, "output": "a.####.exr"},
+            "volumes": [{"cache": "a.####.vdb", "extinction": 1.0, "anisotropy": 0.8}],
+            "camera": {"position": [0, 0, 2], "look_at": [0, 0, 0]},
+            "transport": {"method": "auto"},
+            "sampling": {"samples": 64, "tolerance": 0.1},
+        }
+    )
+    orders = np.arange(PILOT_ORDERS + 1, dtype=np.float64)
+    # Half of the tolerance is left out by single scattering; a quarter of it after seven orders.
+    at_single = 0.05 * np.exp2(1.0 - orders)
+    at_seven = 0.025 * np.exp2((7.0 - orders) / 3.0)
+    for tail in (at_single, at_seven):
+        first = decide(shot, Measure(tail * wavering[0]))
+        for factor in wavering[1:]:
+            later = decide(shot, Measure(tail * factor), first)
+            assert (later.method, later.max_bounces) == (first.method, first.max_bounces)
