@@ -20,6 +20,7 @@ from ._core import (
     read_image,
     render,
     render_until,
+    write_grid,
 )
 
 __all__ = [
@@ -42,4 +43,5 @@ __all__ = [
     "read_image",
     "render",
     "render_until",
+    "write_grid",
 ]

@@ -11,6 +11,8 @@ Camera::Camera(const V3d& position, const V3d& look_at, const V3d& up, double fo
     if (!(fov > 0.0 && fov < 180.0))
         throw InputError("camera.fov must lie between 0 and 180 degrees");
     const V3d ahead = look_at - position;
+    if (!std::isfinite(ahead.length2()) || !std::isfinite(up.length2()))
+        throw InputError("camera.position, look_at and up must be within 1e150 of each other");
     if (!(ahead.length() > 0.0))
         throw InputError("camera.look_at equals camera.position; move one of them");
     forward_ = ahead.normalized();

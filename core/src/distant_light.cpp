@@ -9,13 +9,14 @@ class DistantLight final : public Light {
   public:
     DistantLight(const V3f& direction, const Color& irradiance, float angle)
         : towards_(-direction.normalized()) {
-        const double half = 0.5 * angle * std::numbers::pi / 180.0;
-        const double sine = std::sin(0.5 * half);
-        one_minus_cos_ = static_cast<float>(2.0 * sine * sine);
-        if (angle <= 0.0f) {
+        constexpr float least_angle = 1e-5f;  // no float direction can tell a lesser one from none
+        if (angle < least_angle) {
             radiance_ = irradiance;
             return;
         }
+        const double half = 0.5 * angle * std::numbers::pi / 180.0;
+        const double sine = std::sin(0.5 * half);
+        one_minus_cos_ = static_cast<float>(2.0 * sine * sine);
         // A disc of radiance L and half angle h gives a plane that faces it L pi sin^2 h.
         density_ = 1.0f / (2.0f * pi * one_minus_cos_);
         radiance_ =

@@ -155,21 +155,31 @@ std::unique_ptr<const Light> make_dome_light(const Color& radiance, const std::s
 
     const Texture image = read_texture(texture);
     const int channels = image.channels;
-    std::int64_t odd = 0;
+    constexpr float most_radiance = 1e12f;  // its square, and sums of it, stay well inside a float
+    std::int64_t odd = 0, dimmed = 0;
     std::vector<Color> texels;
     texels.reserve(image.values.size() / static_cast<std::size_t>(channels));
     for (auto value = image.values.begin(); value != image.values.end(); value += channels) {
-        Color color(value[0], value[channels > 1 ? 1 : 0], value[channels > 2 ? 2 : 0]);
+        Color color =
+            radiance * Color(value[0], value[channels > 1 ? 1 : 0], value[channels > 2 ? 2 : 0]);
         for (int c = 0; c < 3; ++c) {
-            if (std::isfinite(color[c]) && color[c] >= 0.0f) continue;
-            color[c] = 0.0f;
-            ++odd;
+            if (color[c] > most_radiance && std::isfinite(color[c])) {
+                color[c] = most_radiance;
+                ++dimmed;
+            } else if (!(std::isfinite(color[c]) && color[c] >= 0.0f)) {
+                color[c] = 0.0f;
+                ++odd;
+            }
         }
-        texels.push_back(color * radiance);
+        texels.push_back(color);
     }
     if (odd > 0) {
         warnings.push_back(texture + ": " + std::to_string(odd) +
                            " values are NaN, infinite or negative; taken as 0");
+    }
+    if (dimmed > 0) {
+        warnings.push_back(texture + ": " + std::to_string(dimmed) +
+                           " values are over 1e12; taken as that");
     }
     return std::make_unique<TexturedDome>(std::move(texels), image.width, image.height);
 }

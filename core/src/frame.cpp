@@ -68,6 +68,7 @@ void Frame::add(const Partial& partial) {
                          std::to_string(reached) + " samples that are there, of " +
                          std::to_string(*tile->wanted));
     }
+    bounded_paths_ += partial.bounded_paths;
     if (reached == 0) {
         tile->partial = partial;
     } else {

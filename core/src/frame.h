@@ -38,6 +38,9 @@ class Frame {
     /// The RMS relative error of all pixels that have all of their samples: see `Partial`.
     double relative_error() const;
 
+    /// Paths that the bound on work has ended, of all partials.
+    std::int64_t bounded_paths() const { return bounded_paths_; }
+
   private:
     struct Tile {
         Bucket bucket;
@@ -53,6 +56,7 @@ class Frame {
     std::vector<Tile> tiles_;
     std::string identity_;
     LayeredImage image_;
+    std::int64_t bounded_paths_ = 0;
 };
 
 }  // namespace pileus

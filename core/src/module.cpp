@@ -4,6 +4,7 @@
 #include "make/cloud.h"
 #include "make/whitewater.h"
 #include "render.h"
+#include "vdb_file.h"
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -31,12 +32,22 @@ using Triple = std::array<double, 3>;
 using BucketTuple = std::tuple<int, int, int, int>;
 using RangeTuple = std::tuple<int, int>;
 using Pixels = nb::ndarray<nb::numpy, float>;
+using Array3 = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using PythonHeader =
     std::map<std::string,
              std::variant<std::string, double, std::pair<int, int>, std::vector<double>>>;
 
 V3d to_v3d(const Triple& t) { return {t[0], t[1], t[2]}; }
 V3f to_v3f(const Triple& t) { return V3f(to_v3d(t)); }
+
+/// Light that is there: a negative or infinite one would spoil pixels.
+Color to_light(const char* field, const Triple& t) {
+    for (const double value : t) {
+        if (!(value >= 0.0 && value <= 1e12))
+            throw InputError(std::string("lights.") + field + " must lie between 0 and 1e12");
+    }
+    return to_v3f(t);
+}
 Triple to_triple(const V3d& v) { return {v.x, v.y, v.z}; }
 Bucket to_bucket(const BucketTuple& t) {
     return {std::get<0>(t), std::get<1>(t), std::get<2>(t), std::get<3>(t)};
@@ -120,8 +131,8 @@ Scene make_scene(std::shared_ptr<const Volume> volume, double extinction, const 
         if (!(value >= 0.0 && value <= 1.0))
             throw InputError("volumes.albedo must lie between 0 and 1");
     }
-    if (!(std::abs(anisotropy) < 1.0))
-        throw InputError("volumes.anisotropy must lie between -1 and 1, exclusive");
+    if (!(std::abs(static_cast<float>(anisotropy)) < 1.0f))
+        throw InputError("volumes.anisotropy must lie between -1 and 1, exclusive, as a float");
     if (width < 1 || height < 1)
         throw InputError("image.width and image.height must be at least 1");
     Medium medium(*volume, static_cast<float>(extinction), to_v3f(albedo),
@@ -201,14 +212,16 @@ NB_MODULE(_core, m) {
             "__init__",
             [](DistantLightHandle* self, const Triple& direction, const Triple& irradiance,
                double angle) {
-                if (!(to_v3d(direction).length() > 0.0))
-                    throw InputError("lights.direction has no length");
+                const double length = to_v3d(direction).length();
+                if (!(length > 0.0) || !std::isfinite(length))
+                    throw InputError("lights.direction must have a length, of at most 1e150");
                 if (!(angle >= 0.0 && angle < 180.0))
                     throw InputError("lights.angle must lie between 0 and 180 degrees");
-                new (self) DistantLightHandle{
-                    {make_distant_light(V3f(to_v3d(direction).normalized()), to_v3f(irradiance),
-                                        static_cast<float>(angle)),
-                     {}}};
+                new (self)
+                    DistantLightHandle{{make_distant_light(V3f(to_v3d(direction).normalized()),
+                                                           to_light("irradiance", irradiance),
+                                                           static_cast<float>(angle)),
+                                        {}}};
             },
             nb::kw_only(), "direction"_a, "irradiance"_a, "angle"_a = 0.0,
             "`direction` is the way the light travels, `irradiance` falls on a plane facing it, "
@@ -219,7 +232,7 @@ NB_MODULE(_core, m) {
             "__init__",
             [](DomeLightHandle* self, const Triple& radiance, const std::string& texture) {
                 std::vector<std::string> warnings;
-                auto light = make_dome_light(to_v3f(radiance), texture, warnings);
+                auto light = make_dome_light(to_light("radiance", radiance), texture, warnings);
                 new (self) DomeLightHandle{{std::move(light), std::move(warnings)}};
             },
             nb::kw_only(), "radiance"_a, "texture"_a = "",
@@ -333,6 +346,8 @@ NB_MODULE(_core, m) {
                      "Samples a pixel, over those that have all of theirs.")
         .def("relative_error", &Frame::relative_error,
              "The RMS relative error of the pixels, from their variances.")
+        .def_prop_ro("bounded_paths", &Frame::bounded_paths,
+                     "Paths that the bound on work has ended, of all partials.")
         .def(
             "set_denoised",
             [](Frame& frame,
@@ -400,6 +415,26 @@ NB_MODULE(_core, m) {
         },
         "path"_a,
         "An EXR's float arrays of shape (height, width), by part and channel. Raises InputError.");
+
+    m.def(
+        "write_grid",
+        [](const std::string& path, const std::vector<std::pair<std::array<int, 3>, Array3>>& parts,
+           const Triple& voxel, const Triple& origin, const std::string& name) {
+            std::vector<Block> blocks;
+            for (const auto& [low, array] : parts) {
+                const auto side = [&](std::size_t axis) {
+                    return static_cast<int>(array.shape(axis));
+                };
+                blocks.push_back(
+                    {V3i(low[0], low[1], low[2]), V3i(side(0), side(1), side(2)), array.data()});
+            }
+            const nb::gil_scoped_release release;
+            write_grid(path, name, blocks, to_v3d(voxel), to_v3d(origin));
+        },
+        "path"_a, "blocks"_a, nb::kw_only(), "voxel"_a = Triple{1.0, 1.0, 1.0},
+        "origin"_a = Triple{0.0, 0.0, 0.0}, "name"_a = "density",
+        "Writes float32 arrays, each with the index of its first value, as one grid; index (i, j, "
+        "k) lies at origin + (i, j, k) * voxel. Raises InputError, RuntimeError.");
 
     const auto bind_make = [&m](const char* name, auto make, const char* doc) {
         m.def(

@@ -7,7 +7,6 @@
 #include <bit>
 #include <cmath>
 #include <cstdio>
-#include <limits>
 
 namespace pileus {
 
@@ -165,7 +164,7 @@ void Partial::pool(const Partial& other) {
                 const double squares = mine(variance_r + c)[pixel] * n1 * (n1 - 1.0) +
                                        theirs(variance_r + c)[pixel] * n2 * (n2 - 1.0) +
                                        gap * gap * n1 * n2 / n;
-                mine(variance_r + c)[pixel] = static_cast<float>(squares / (n * (n - 1.0)));
+                mine(variance_r + c)[pixel] = storable(squares / (n * (n - 1.0)));
             }
             for (std::size_t c = r; c <= a; ++c) mean(c);
             for (std::size_t c = first_order; c < image.channels().size(); ++c) mean(c);

@@ -4,7 +4,9 @@
 
 #include "exr_file.h"
 
+#include <algorithm>
 #include <cstdint>
+#include <limits>
 #include <string>
 
 namespace pileus {
@@ -15,6 +17,11 @@ struct SampleRange {
     int count() const { return last - first; }
     auto operator<=>(const SampleRange&) const = default;
 };
+
+/// What a channel holds of a value: no infinity, but the greatest float.
+inline float storable(double value) {
+    return static_cast<float>(std::min(value, double{std::numeric_limits<float>::max()}));
+}
 
 /// The channels of partials and frames: R, G, B, A, Z, the variance of the pixel mean, then the
 /// orders.

@@ -48,7 +48,7 @@ class PixelSums {
         const double n = count;
         for (std::size_t look = 0; look < sum_.size(); ++look) {
             const auto set = [&](std::size_t channel, double value) {
-                image.plane(look, channel)[pixel] = static_cast<float>(value);
+                image.plane(look, channel)[pixel] = storable(value);
             };
             for (int c = 0; c < 3; ++c) {
                 const auto channel = static_cast<std::size_t>(c);

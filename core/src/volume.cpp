@@ -9,6 +9,7 @@
 
 #include <chrono>
 #include <cmath>
+#include <cstdio>
 #include <filesystem>
 
 namespace pileus {
@@ -102,6 +103,17 @@ void Volume::take(Grid& grid) {
     if (!std::isfinite(determinant) || determinant == 0.0) {
         throw InputError("grid \"" + grid_ +
                          "\" has a transform without inverse; give it voxels with a volume");
+    }
+    constexpr double least = 1e-12, most = 1e12;  // what rays in float can step through
+    for (int axis = 0; axis < 3; ++axis) {
+        const double side =
+            V3d(local_to_world_[axis][0], local_to_world_[axis][1], local_to_world_[axis][2])
+                .length();
+        if (side >= least && side <= most) continue;
+        char text[32];
+        std::snprintf(text, sizeof text, "%.3g", side);
+        throw InputError("grid \"" + grid_ + "\" has voxels " + text +
+                         " world units wide; scale it to between 1e-12 and 1e12");
     }
     world_to_local_ = local_to_world_.inverse();
 }

@@ -175,6 +175,7 @@ class Farm:
                         file=done.file,
                         seconds=done.seconds,
                         reason=done.reason,
+                        bounded_paths=done.bounded_paths,
                     )
                 )
             else:

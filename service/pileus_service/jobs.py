@@ -135,6 +135,7 @@ class Done(Record):
     method: str
     max_bounces: int | None
     reason: str
+    bounded_paths: int = 0
 
 
 class Task(Record):
@@ -244,6 +245,7 @@ class FrameView(Record):
     reason: str | None = None
     file: str | None = None
     seconds: float | None = None
+    bounded_paths: int = 0
 
 
 class FrameMap(Record):

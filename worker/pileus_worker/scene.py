@@ -104,7 +104,9 @@ def identity(shot: Shot, frame: int, cache: Cache) -> str:
     return hashlib.sha256(json.dumps(pixels, sort_keys=True).encode()).hexdigest()
 
 
-def header(shot: Shot, frame: int, resolved: Resolved, seconds: float) -> Header:
+def header(
+    shot: Shot, frame: int, resolved: Resolved, seconds: float, bounded_paths: int
+) -> Header:
     """What a pipeline wants to know of an image."""
     camera = make_camera(shot, frame)
     rate = Fraction(shot.fps).limit_denominator(1001)
@@ -117,4 +119,5 @@ def header(shot: Shot, frame: int, resolved: Resolved, seconds: float) -> Header
         "pileus.frame": str(frame),
         "pileus.shot": shot.model_dump_json(),
         "pileus.transport": resolved.model_dump_json(),
+        "pileus.boundedPaths": str(bounded_paths),
     }

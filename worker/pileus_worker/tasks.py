@@ -248,7 +248,7 @@ class Work:
             frame.write(
                 staged,
                 half=shot.image.pixel_type == "half",
-                header=scene.header(shot, self.frame, resolved, seconds),
+                header=scene.header(shot, self.frame, resolved, seconds, frame.bounded_paths),
             )
             self.permit()
             Path(staged).replace(location)
@@ -263,6 +263,7 @@ class Work:
                 method=resolved.method,
                 max_bounces=resolved.max_bounces,
                 reason=resolved.reason,
+                bounded_paths=frame.bounded_paths,
             )
         )
         self._tidy(files)

@@ -1,14 +1,11 @@
-// Packs leaves into OpenVDB trees and writes them whole or not at all.
+// Packs leaves into OpenVDB trees.
 #include "blocks.h"
+
+#include "../vdb_file.h"
 
 #include <openvdb/tools/Prune.h>
 
 #include <algorithm>
-#include <exception>
-#include <filesystem>
-#include <stdexcept>
-#include <system_error>
-#include <unistd.h>
 
 namespace pileus::make {
 
@@ -65,24 +62,7 @@ std::int64_t Cache::write(const std::string& path, const MakeOptions& options,
     metadata.insertMeta("resolution", openvdb::Int32Metadata(options.resolution));
     metadata.insertMeta("seed", openvdb::Int64Metadata(static_cast<std::int64_t>(options.seed)));
 
-    namespace fs = std::filesystem;
-    const std::string temporary = path + "." + std::to_string(::getpid()) + ".tmp";
-    std::error_code ignored;
-    try {
-        openvdb::io::File file(temporary);
-        file.write(openvdb::GridCPtrVec{density_, velocity_}, metadata);
-        file.close();
-        fs::rename(temporary, path);
-    } catch (const fs::filesystem_error& error) {
-        fs::remove(temporary, ignored);
-        throw std::runtime_error(path + ": cannot be written: " + error.code().message());
-    } catch (const std::exception&) {
-        fs::remove(temporary, ignored);
-        const fs::path folder = fs::path(path).parent_path();
-        const bool missing = !folder.empty() && !fs::is_directory(folder, ignored);
-        throw std::runtime_error(path + ": cannot be written: " +
-                                 (missing ? "no such folder" : "the folder refuses it or is full"));
-    }
+    write_vdb(path, {density_, velocity_}, metadata);
     return active;
 }
 

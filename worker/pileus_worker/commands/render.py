@@ -81,10 +81,14 @@ class Renderer:
         denoise(frame, shot, self._threads)
         output = shot.output(number)
         output.parent.mkdir(parents=True, exist_ok=True)
-        header = scene.header(shot, number, resolved, render_seconds)
+        header = scene.header(shot, number, resolved, render_seconds, frame.bounded_paths)
         frame.write(str(output), half=image.pixel_type == "half", header=header)
         seconds = time.monotonic() - begun
         self._display.note(f"frame {number}: {output}, {duration(seconds)}")
+        if frame.bounded_paths:
+            self._display.note(
+                f"frame {number}: {frame.bounded_paths} paths met the bound on work and were ended"
+            )
         error, noise = frame.relative_error(), resolved.noise
         if noise is not None and error > noise:
             self._display.note(
@@ -102,6 +106,7 @@ class Renderer:
             "method": resolved.method,
             "max_bounces": resolved.max_bounces,
             "reason": resolved.reason,
+            "bounded_paths": frame.bounded_paths,
         }
 
     def _watched(self, index: int, number: int, volume: core.Volume) -> tuple[Resolved, core.Frame]:
