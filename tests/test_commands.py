@@ -44,7 +44,7 @@ def test_render_writes_each_frame_and_reports_it(shot_file: Path, tmp_path: Path
     [report] = json.loads(ended.stdout)["frames"]
     assert report.keys() == {
         "frame", "file", "seconds", "load_seconds", "render_seconds",
-        "samples", "error", "method", "max_bounces", "reason",
+        "samples", "error", "method", "max_bounces", "reason", "bounded_paths",
     }  # fmt: skip
     assert (report["frame"], report["samples"], report["max_bounces"]) == (2, 4, 4)
     [channels] = core.read_image(str(tmp_path / "out" / "test.0002.exr")).values()
@@ -75,6 +75,19 @@ def test_make_writes_a_sequence(tmp_path: Path) -> None:
     for name in ("cloud.001.vdb", "cloud.002.vdb"):
         assert core.Volume(str(tmp_path / "new" / name)).active_voxels > 0
     assert "put ####" in refused(pileus("make", "cloud", tmp_path / "a.vdb", "--frames", "1-2"))
+
+    # A frame made alone is the one of the whole sequence; another length is another action.
+    voxels = core.Volume(str(tmp_path / "new" / "cloud.002.vdb")).active_voxels
+    for length, same in ((24, True), (2, False)):
+        alone = tmp_path / f"alone.{length}.vdb"
+        ended = pileus(
+            "make", "cloud", alone, "--frames", "2", "--resolution", "32", "--length", f"{length}"
+        )
+        assert ended.returncode == 0, ended.stderr
+        assert (core.Volume(str(alone)).active_voxels == voxels) is same
+    assert "greater --length" in refused(
+        pileus("make", "cloud", tmp_path / "a.vdb", "--frames", "3", "--length", "2")
+    )
 
 
 def test_compare_tells_the_error_as_it_is_defined(shot_file: Path, tmp_path: Path) -> None:

@@ -20,35 +20,67 @@ app = typer.Typer(
     name="make", help="Makes procedural animated VDB caches, with velocity.", no_args_is_help=True
 )
 
+USUAL_LENGTH = 24
+
 Subject = Literal["cloud", "whitewater"]
 Frames = Annotated[str, typer.Option(help='The frames, as "1-24".')]
 Resolution = Annotated[int, typer.Option(min=8, max=4096, help="Voxels a world unit.")]
 Seed = Annotated[int, typer.Option(min=0, help="Another seed, another shape.")]
+Length = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Frames of the whole action, from 1 on.  [default: 24, or the last frame]"
+    ),
+]
 Out = Annotated[str, typer.Argument(metavar="OUT", help="The files, as caches/cloud.####.vdb.")]
 
 
 @app.command()
-def cloud(out: Out, frames: Frames = "1-24", resolution: Resolution = 256, seed: Seed = 0) -> None:
+def cloud(
+    out: Out,
+    frames: Frames = "1-24",
+    resolution: Resolution = 256,
+    seed: Seed = 0,
+    length: Length = None,
+) -> None:
     """A fractal cumulus that drifts and billows."""
-    make("cloud", out, frames, resolution, seed)
+    make("cloud", out, frames, resolution, seed, length)
 
 
 @app.command()
 def whitewater(
-    out: Out, frames: Frames = "1-24", resolution: Resolution = 256, seed: Seed = 0
+    out: Out,
+    frames: Frames = "1-24",
+    resolution: Resolution = 256,
+    seed: Seed = 0,
+    length: Length = None,
 ) -> None:
     """A breaking splash with spray."""
-    make("whitewater", out, frames, resolution, seed)
+    make("whitewater", out, frames, resolution, seed, length)
 
 
-def make(subject: Subject, out: str, frames: str, resolution: int, seed: int = 0) -> None:
-    """Makes the frames in parallel processes."""
+def make(
+    subject: Subject,
+    out: str,
+    frames: str,
+    resolution: int,
+    seed: int = 0,
+    length: int | None = None,
+) -> None:
+    """Makes the frames in parallel processes. A frame is the same whichever others are made."""
     try:
         numbers = parse_frames(frames)
     except ValueError as error:
         raise InputError(f"--frames {frames}: {error}") from None
     if len(numbers) > 1 and not has_pattern(out):
         raise InputError(f"{out}: every frame would write this one file; put #### for the number")
+    action = length or max(USUAL_LENGTH, *numbers)
+    outside = [number for number in numbers if not 1 <= number <= action]
+    if outside:
+        raise InputError(
+            f"--frames {frames}: frame {outside[0]} lies outside the action, 1 to {action}; "
+            "take a frame within it or a greater --length"
+        )
     begun = time.monotonic()
     voxels = 0
     with (
@@ -60,8 +92,8 @@ def make(subject: Subject, out: str, frames: str, resolution: int, seed: int = 0
     ):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         jobs = [
-            pool.submit(_frame, subject, expand(out, number), index, len(numbers), resolution, seed)
-            for index, number in enumerate(numbers, 1)
+            pool.submit(_frame, subject, expand(out, number), number, action, resolution, seed)
+            for number in numbers
         ]
         for done, job in enumerate(as_completed(jobs), 1):
             voxels += job.result()
@@ -74,6 +106,6 @@ def make(subject: Subject, out: str, frames: str, resolution: int, seed: int = 0
     )
 
 
-def _frame(subject: Subject, path: str, index: int, count: int, resolution: int, seed: int) -> int:
+def _frame(subject: Subject, path: str, frame: int, action: int, resolution: int, seed: int) -> int:
     write = core.make_cloud if subject == "cloud" else core.make_whitewater
-    return int(write(path, frame=index, frames=count, resolution=resolution, seed=seed))
+    return int(write(path, frame=frame, frames=action, resolution=resolution, seed=seed))
