@@ -38,6 +38,7 @@ constexpr float kShutter = 0.014F;  // drops are drawn out over this time
 constexpr float kSheetX = 0.95F;    // half extents of the foam on the water
 constexpr float kSheetBack = -0.42F;
 constexpr float kSheetFront = 0.55F;
+constexpr float kLeastAmount = 1e-4F;
 constexpr float kLargestChurn = 0.085F;
 
 // Water in flight, drawn out along its path. A drop has a hard edge; spray is a soft streak of
@@ -145,7 +146,7 @@ class Splash {
   private:
     // The part of the action that a sequence shows, in action seconds.
     static constexpr float kStart = 0.10F;
-    static constexpr float kAction = 0.80F;
+    static constexpr float kAction = 0.70F;
 
     Vec3f place(const Coord& ijk) const {
         return Vec3f(static_cast<float>(ijk.x()), static_cast<float>(ijk.y()),
@@ -218,15 +219,38 @@ class Splash {
                      velocity, Kind::kDrop});
                 continue;
             }
-            // A strand leaves as solid water; it swells and thins as it flies, and parts between
-            // its beads.
+            // A strand leaves as solid water, parts between its beads as it thins, and breaks into
+            // drops; what it sheds in between is gone within a moment.
+            const float whole = 0.06F + 0.22F * size * (1.0F - 0.5F * rank);
+            if (flight > whole) {
+                break_up(noise::combine(beads, static_cast<std::uint32_t>(i)), at, velocity,
+                         flight - whole);
+            }
             const float bead = noise::value(rank * 22.0F, beads);
-            const float swell = 1.0F + 2.2F * smoothstep(0.0F, 0.7F, flight);
+            const float swell = 1.0F + 1.2F * smoothstep(0.0F, 0.5F, flight);
             const float parted = smoothstep(0.02F, 0.45F, flight);
-            const float amount = std::clamp(1.5F * bead + 0.5F - 1.2F * parted, 0.02F, 1.0F) /
+            const float shed = std::exp(-std::max(0.0F, flight - whole) / 0.07F);
+            const float amount = shed *
+                                 std::clamp(1.5F * bead + 0.5F - 1.2F * parted, 0.02F, 1.0F) /
                                  (swell * swell * swell);
+            if (amount < kLeastAmount) continue;
             const float radius = girth * swell * (0.0065F - 0.0028F * rank) * (0.5F + 0.7F * size);
             add({at, at - velocity * (2.0F * kShutter), radius, amount, velocity, Kind::kSpray});
+        }
+    }
+
+    // A piece of a strand becomes drops, many small and few large, that part from each other.
+    void break_up(std::uint32_t seed, const Vec3f& middle, const Vec3f& velocity, float since) {
+        constexpr int kPieces = 3;
+        noise::Random random(seed);
+        for (int i = 0; i < kPieces; ++i) {
+            const Vec3f apart = random.bells() * 0.11F;
+            const float size = random();
+            const Vec3f at = middle + apart * since;
+            if (at.y() < kWater - 0.02F) continue;
+            const Vec3f flying = velocity + apart;
+            const float radius = 0.0006F + 0.0030F * std::pow(size, 5.0F);
+            add({at, at - flying * kShutter, radius, 1.0F, flying, Kind::kDrop});
         }
     }
 
@@ -254,7 +278,7 @@ class Splash {
             if (at.y() < kWater) continue;
             const float radius = (0.014F + 0.034F * size * size) * (0.6F + 1.1F * age);
             const float amount =
-                0.0055F * smoothstep(0.0F, 0.06F, age) * (1.0F - smoothstep(0.35F, 0.95F, age));
+                0.0022F * smoothstep(0.0F, 0.06F, age) * (1.0F - smoothstep(0.20F, 0.75F, age));
             if (amount > 0.0F) add({at, at, radius, amount, velocity, Kind::kMist});
         }
     }
