@@ -82,6 +82,11 @@ $(VENV)/.pileus: pyproject.toml $(VENV)/.core
 	$(PIP) --editable '.[worker,denoise,dev]'
 	@touch $@
 
+.PHONY: stability
+# About ten minutes; writes docs/stability.md.
+stability: setup
+	PYTHONPATH=tests $(PYTHON) -m stability
+
 build/.built: $(CORE) $(VENV)/.system
 	cmake -S core -B build -G Ninja
 	cmake --build build --parallel $(JOBS)
