@@ -61,13 +61,14 @@ void Frame::add(const Partial& partial) {
                          " is of another frame (identity, looks or orders differ)");
     }
     const int reached = tile->partial.samples.last;
-    if (!tile->wanted) tile->wanted = partial.samples.last;
+    const int wanted = tile->wanted.value_or(partial.samples.last);
     if (partial.samples.count() < 1 || partial.samples.first != reached ||
-        partial.samples.last > *tile->wanted) {
+        partial.samples.last > wanted) {
         throw InputError(text(window) + ": " + text(partial.samples) + " does not follow the " +
                          std::to_string(reached) + " samples that are there, of " +
-                         std::to_string(*tile->wanted));
+                         std::to_string(wanted));
     }
+    tile->wanted = wanted;
     bounded_paths_ += partial.bounded_paths;
     if (reached == 0) {
         tile->partial = partial;

@@ -38,7 +38,7 @@ Partial make_partial(const Bucket& bucket, const SampleRange& samples, const std
 }
 
 const Bucket left{0, 0, 16, 12}, right{16, 0, 24, 12};
-const std::vector<std::pair<Bucket, int>> plan{{left, 16}, {right, 8}};
+const std::vector<std::pair<Bucket, std::optional<int>>> plan{{left, 16}, {right, 8}};
 
 std::string refusal(const std::function<void()>& action) {
     try {
@@ -75,6 +75,22 @@ TEST(Frame, IsCompleteOnlyWithEveryBucketAndSample) {
     const ExrFile file = read_exr(path);
     EXPECT_EQ(file.image.window(), (Bucket{0, 0, width, height}));
     EXPECT_EQ(file.image.looks(), (std::vector<std::string>{"hero", "fill"}));
+}
+
+TEST(Frame, TakesAsManySamplesAsAnOpenBucketsOnePartialHas) {
+    const test::TemporaryFolder folder;
+    Frame frame(width, height, {{left, std::nullopt}, {right, std::nullopt}});
+    const auto refused = [&](const Partial& partial) {
+        return !refusal([&] { frame.add(partial); }).empty();
+    };
+    EXPECT_TRUE(refused(make_partial(left, {4, 8}, "shot"))) << "after a gap";
+    EXPECT_FALSE(refused(make_partial(left, {0, 24}, "shot")));
+    EXPECT_TRUE(refused(make_partial(left, {24, 32}, "shot"))) << "a second one";
+    EXPECT_NE(refusal([&] { frame.write(folder.path("frame.exr"), false, {}); }), "");
+    EXPECT_FALSE(refused(make_partial(right, {0, 6}, "shot")));
+    frame.write(folder.path("frame.exr"), false, {});
+    // 16 columns of 24 samples and 8 of 6.
+    EXPECT_DOUBLE_EQ(frame.mean_samples(), 18.0);
 }
 
 TEST(Frame, RefusesWhatIsDoubledMissingOrForeign) {
