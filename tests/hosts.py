@@ -9,7 +9,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
+import pileus_core as core
+
 from pileus_service.client import Client
+from pileus_service.shot import Shot
 
 PILEUS = Path(sys.executable).with_name("pileus")
 
@@ -53,7 +57,7 @@ def service(data: Path, redis: str, *roots: Path) -> Iterator[Client]:
             assert serving.poll() is None, log.read_text()
             return _connects(port)
 
-        until(answers, 30)
+        until(answers, 120)
         yield client
 
 
@@ -63,6 +67,18 @@ def until(holds: Callable[[], object], seconds: float) -> None:
     while not holds():
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def same_images(shot: Shot, folder: Path) -> None:
+    """The farm's images are those that `pileus render` makes here."""
+    file = folder / "shot.json"
+    file.write_text(shot.model_dump_json())
+    subprocess.run([PILEUS, "render", file, "--out", folder / "here"], check=True)
+    for frame in shot.frame_numbers:
+        [farm] = core.read_image(str(shot.output(frame))).values()
+        [here] = core.read_image(str(folder / "here" / shot.output(frame).name)).values()
+        for name, values in here.items():
+            np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
 
 
 def free_port() -> int:

@@ -57,7 +57,7 @@ def test_a_worker_renders_where_its_own_mounts_are(
         command: list[str | Path] = [PILEUS, "worker", "--data", data, "--redis", redis_url]
         command += ["--root", here, "--map", f"{farm}={here}", "--threads", "1"]
         with process(tmp_path / "worker.log", *command):
-            until(lambda: client.job(job).state in ("done", "failed"), 60)
+            until(lambda: client.job(job).state in ("done", "failed"), 300)
         assert client.job(job).state == "done", client.job(job).reason
         assert [frame.file for frame in client.frames(job)] == [str(asked.output(1))]
     assert core.read_image(str(here / "out" / "test.0001.exr"))

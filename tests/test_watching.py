@@ -17,7 +17,7 @@ import httpx
 import pileus_core as core
 import pytest
 import structlog
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
@@ -26,7 +26,7 @@ from pileus_service.client import Client
 from pileus_service.jobs import FrameMap, Job, JobState, JobView, Wish
 from pileus_service.shot import Shot
 from pileus_service.store import Store
-from pileus_worker.embedded import EmbeddedFarm, embedded_farm
+from pileus_worker.embedded import LOG_BYTES, EmbeddedFarm, Workers, embedded_farm
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
 
@@ -59,7 +59,7 @@ def test_a_crashed_attempt_is_told_in_its_frames_log_and_counted(
 ) -> None:
     with Client(farm.url) as client:
         job = client.submit(one_frame).job.id
-        end = time.monotonic() + 60
+        end = time.monotonic() + 120
         while not (busy := [w for w in client.workers() if w.task and w.task.kind == "render"]):
             assert time.monotonic() < end
             time.sleep(0.05)
@@ -98,6 +98,20 @@ def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame:
     assert [int(line.event.split()[0]) for line in lines] == list(range(950, 1000))
 
 
+def test_the_workers_log_is_bounded(tmp_path: Path) -> None:
+    with (tmp_path / "workers.log").open("ab") as log:
+        writer = Workers(["sh", "-c", "while echo line; do sleep 0.01; done"], 1, log)
+        try:
+            log.truncate(LOG_BYTES + 1)
+            writer.keep_up()
+            time.sleep(0.3)
+        finally:
+            writer.end()
+    assert (tmp_path / "workers.old.log").stat().st_size > LOG_BYTES
+    assert 0 < (tmp_path / "workers.log").stat().st_size < 10_000
+
+
+@settings(deadline=None)
 @given(st.text("prmdfc.", min_size=1, max_size=300))
 def test_the_grid_has_a_mark_for_every_frame_in_its_place(states: str) -> None:
     frame_map = FrameMap(frames=f"10-{9 + len(states)}", states=states, width=1, height=1)

@@ -63,6 +63,13 @@ class FrameStore:
     def part(self, part: Part) -> Path:
         return self.folder / "parts" / part.name
 
+    def look_again(self) -> None:
+        """Has an NFS client ask which names there are: it may remember one as absent that another
+        host has made since, and asks anew when a folder is opened (close-to-open consistency)."""
+        for folder in (self.folder, self.folder / "parts"):
+            with contextlib.suppress(FileNotFoundError):
+                os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
+
     def plan(self) -> Plan | None:
         return _read(self.folder / "plan.json", Plan)
 

@@ -19,6 +19,15 @@ from pileus_service.frames import MAX_FRAMES, expand, has_pattern, parse_frames
 from pileus_service.shot import Shot
 from pileus_service.shotfile import MAX_BYTES, load_shot, parse_shot
 
+# The same examples on each machine, however slow it is.
+settings.register_profile(
+    "steady",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+settings.load_profile("steady")
+
 SHOT: dict[str, Any] = {
     "name": "test",
     "frames": "1-3",
@@ -146,7 +155,7 @@ def test_a_spoiled_shot_is_a_shot_or_one_line(data: dict[str, Any]) -> None:
         assert all(path for _, path in shot.inputs(frame))
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(
     st.binary(max_size=60) | st.text(max_size=60).map(str.encode), st.sampled_from(["toml", "json"])
 )
@@ -165,7 +174,7 @@ def test_any_file_is_a_shot_or_one_line(tmp_path: Path, data: bytes, kind: str) 
     assert ("is this a shot?" in str(refused.value)) == (len(data) > MAX_BYTES)
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200)
 @given(st.text(max_size=30), st.text(max_size=30))
 @example("sampling.samples", "9" * 5000)
 @example("a", "[" * 100_000)
@@ -190,7 +199,7 @@ def toml(value: Any) -> str:
     return json.dumps(value)
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50)
 @given(st.integers(1, 1 << 20), st.floats(1e-3, 1e6), st.text("abc é", min_size=1, max_size=9))
 def test_toml_and_json_say_the_same(
     tmp_path: Path, samples: int, extinction: float, name: str

@@ -69,6 +69,7 @@ class Work:
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
         files = self.store.frame(self.job.id, self.frame)
+        files.look_again()
         if files.done() is not None:
             return self._already_done(files)
         try:
