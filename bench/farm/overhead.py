@@ -1,6 +1,6 @@
 """What the farm costs: a 24-frame shot on a running farm beside `pileus render`, on the same cores.
 
-    PYTHONPATH=tests .venv/bin/python bench/farm/overhead.py --repeat 3
+    PYTHONPATH=tests .venv/bin/python -m farm.overhead --repeat 3
 
 They take turns in one run; the figure is the ratio of the medians.
 """

@@ -1,6 +1,6 @@
 """The service under load: 10,000 jobs, a farm that works, 500 listeners; cancel and pause.
 
-    PYTHONPATH=tests .venv/bin/python bench/farm/service_load.py
+    PYTHONPATH=tests .venv/bin/python -m farm.service_load
 
 A real service and real workers. `idle_ms` is a request to /healthz in the same run: what this
 machine takes to answer at all.

@@ -1,7 +1,7 @@
 """Workers that only pretend to render, over the real queue code and a real Redis.
 
-    .venv/bin/python bench/farm/simulation.py            # every figure
-    .venv/bin/python bench/farm/simulation.py growth     # one of them
+    .venv/bin/python -m farm.simulation            # every figure
+    .venv/bin/python -m farm.simulation growth     # one of them
 
 `cycles`: claim and complete as fast as it goes, 64 workers. `growth`: 1 to 1,000 workers with tasks
 of 4 s, renewed and looked after as real ones are; what Redis spends on them, what they wait.

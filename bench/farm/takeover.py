@@ -1,6 +1,6 @@
 """How long a killed worker's task waits until another has it, over many kills.
 
-    PYTHONPATH=tests .venv/bin/python bench/farm/takeover.py --kills 100
+    PYTHONPATH=tests .venv/bin/python -m farm.takeover --kills 100
 
 A real farm whose workers are all busy with tasks of a second or two; a quarter of them are killed
 at a time, with SIGKILL, at random moments.
@@ -16,15 +16,14 @@ import tempfile
 import time
 from pathlib import Path
 
-from service_load import make_shot
-
 from chaos.farm import Farm, until
+from farm.service_load import make_shot
 
 
 def holders(farm: Farm) -> dict[str, str]:
     """Who holds each entry in flight."""
     pending = farm.queue.redis.xpending_range("pileus:tasks:5", "workers", "-", "+", 1000)
-    return {held["message_id"]: held["consumer"] for held in pending}
+    return {str(held["message_id"]): str(held["consumer"]) for held in pending}
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pileus_service import __version__, doctor, terminal, tokens
+from pileus_service import __version__, doctor, terminal
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.jobs import JobState
@@ -73,9 +73,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-
-app.add_typer(tokens.app)
 
 
 @app.callback(invoke_without_command=True)
@@ -194,7 +191,7 @@ def _verb(verb: Literal["cancel", "pause", "resume", "retry"], text: str) -> Non
 
 
 _verb("cancel", "Stops a job for good.")
-_verb("pause", "Holds a job's tasks back; those that run finish.")
+_verb("pause", "Stops a job's work until it is resumed.")
 _verb("resume", "Lets a paused job go on.")
 _verb("retry", "Renders the failed frames of a job again, and no others.")
 

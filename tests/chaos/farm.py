@@ -129,7 +129,7 @@ class Farm:
             for part in (*self.workers, self.service):
                 part.end()
 
-    def until_served(self, seconds: float = 30) -> float:
+    def until_served(self, seconds: float = 120) -> float:
         """Waits until the service answers; returns for how long it did not."""
         begun = time.monotonic()
         while True:

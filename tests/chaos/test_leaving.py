@@ -1,5 +1,6 @@
 """Workers that leave: told to, and cut off."""
 
+import ipaddress
 import json
 import os
 import signal
@@ -64,6 +65,28 @@ def test_sigterm_hands_back_what_takes_longer(cached_shot: Shot, tmp_path: Path)
         assert farm.queue.stats().get("leases_lost", 0) == 0
 
 
+@pytest.mark.parametrize("verb", ["pause", "cancel"])
+def test_a_job_that_is_not_to_run_stops_in_the_renderer(
+    cached_shot: Shot, tmp_path: Path, verb: str
+) -> None:
+    """Its task would take minutes."""
+    with Farm(tmp_path, [tmp_path], 1, task_seconds=600) as farm:
+        job = farm.client.submit(with_samples(cached_shot, 100_000)).job.id
+        until(lambda: bool(at_work(farm)))
+        begun = time.monotonic()
+        farm.client.control(job, verb)
+        until(lambda: not at_work(farm))
+        print(f"stopped after {time.monotonic() - begun:.2f} s")
+        until(lambda: not any(any(depth) for depth in farm.queue.depths().values()))
+        if verb == "pause":
+            farm.client.control(job, "resume")
+            until(lambda: bool(at_work(farm)))
+            [worker] = at_work(farm)
+            assert worker.task is not None
+            assert worker.task.attempt == 1, "a task that was paused has not failed"
+        assert farm.queue.stats().get("attempts_failed", 0) == 0
+
+
 def test_a_drained_worker_finishes_and_rests(cached_shot: Shot, tmp_path: Path) -> None:
     with Farm(tmp_path, [tmp_path], 2, task_seconds=0.5) as farm:
         farm.until_workers(2)
@@ -86,7 +109,11 @@ def test_a_drained_worker_finishes_and_rests(cached_shot: Shot, tmp_path: Path) 
 @pytest.fixture
 def cable() -> Iterator[tuple[str, str, str]]:
     """A network namespace for a worker, with a cable to us: its name, our end, our address."""
-    space, here, there = f"pileus{os.getpid()}", f"ph{os.getpid()}", f"pt{os.getpid()}"
+    pid = os.getpid()
+    space, here, there = f"pileus{pid}", f"ph{pid}", f"pt{pid}"
+    # A net of four addresses, not that of another run, which may be one that was killed.
+    net = ipaddress.ip_network((0x0AE70000 | (pid & 0x3FFF) << 2, 30))
+    ours, theirs = net.hosts()
 
     def ip(*words: str) -> None:
         subprocess.run(["ip", *words], check=True, capture_output=True)
@@ -97,11 +124,11 @@ def cable() -> Iterator[tuple[str, str, str]]:
         pytest.skip("no right to make a network namespace, or no ip command")
     try:
         ip("link", "add", here, "type", "veth", "peer", "name", there, "netns", space)
-        ip("addr", "add", "10.231.77.1/30", "dev", here)
+        ip("addr", "add", f"{ours}/30", "dev", here)
         ip("link", "set", here, "up")
-        ip("-n", space, "addr", "add", "10.231.77.2/30", "dev", there)
+        ip("-n", space, "addr", "add", f"{theirs}/30", "dev", there)
         ip("-n", space, "link", "set", there, "up")
-        yield space, here, "10.231.77.1"
+        yield space, here, str(ours)
     finally:
         ip("netns", "delete", space)
 
@@ -144,6 +171,7 @@ def test_a_worker_cut_off_for_a_minute_drops_its_work_and_comes_back(
             same_bits(shot, farm.data, job, 1, tmp_path)
             assert farm.leftovers() == []
         finally:
+            print((tmp_path / "far.log").read_text())
             process.send_signal(signal.SIGTERM)
             process.wait(20)
 

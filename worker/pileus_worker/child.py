@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pileus_worker.tasks import Work
 
 TICK = 0.1
+NICE = 5
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ def run(pipe: "Connection[Any, Any]", output: "Connection[Any, Any]", setup: Set
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
+    # After the service, Redis and the supervisors of the same machine: they need little, and soon.
+    os.nice(NICE)
     _limit(setup)
     try:
         Life(pipe, setup).live()

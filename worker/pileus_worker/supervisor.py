@@ -330,7 +330,7 @@ class Supervisor:
                         ready = False
                 if now >= look:
                     look = now + LOOK
-                    if self._queue.state(task.job) not in ("running", "paused"):
+                    if self._queue.state(task.job) != "running":
                         self._give_up(renderer, task)
                         return None
             except RedisError as error:
