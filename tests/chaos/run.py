@@ -135,7 +135,7 @@ def chaos(
                     break
                 except FarmError:
                     time.sleep(0.1)
-            retried += finish(farm, job, 600)
+            retried += finish(farm, job, 3600)
             jobs.append((job, shot))
             done += sum(len(plan_of(farm.data, job, n).parts) + 2 for n in shot.frame_numbers)
         killer.over.set()
