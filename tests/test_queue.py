@@ -195,6 +195,19 @@ def test_pause_holds_every_task_and_resume_lets_them_go_once(queue: Queue) -> No
     )
 
 
+def test_the_time_left_counts_no_time_that_a_job_was_paused(queue: Queue) -> None:
+    submit(queue)
+    for _ in range(2):
+        do(queue, take(queue), tasks=3)
+    queue.control("job", "pause")
+    for moment in ("started", "paused"):  # as if it had rested for an hour
+        queue.redis.hincrby("pileus:job:job", moment, -3_600_000)
+    queue.control("job", "resume")
+    seen = queue.job("job")
+    assert seen and seen.seconds_left is not None
+    assert seen.seconds_left < 600
+
+
 def test_cancel_drops_waiting_tasks_and_is_seen_by_running_ones(queue: Queue) -> None:
     submit(queue, frames=3)
     running = take(queue)

@@ -42,6 +42,16 @@ def plan(version: str) -> Planned:
     return Planned(tasks=3, finished=[], total=30, samples=0, version=version)
 
 
+def planned_by_old(redis: Redis, result: Planned) -> Queue:
+    """A queue with one job, whose frame the old worker has planned."""
+    queue = Queue(redis, LEASE)
+    queue.submit("job", "job", time.time(), 1, Wish())
+    task = queue.claim(OLD)
+    assert task
+    assert queue.complete(task, OLD.name, result)
+    return queue
+
+
 def test_a_worker_leaves_jobs_of_a_newer_format_to_newer_workers(redis: Redis) -> None:
     old, new = Queue(redis, LEASE), Queue(redis, LEASE, FORMAT + 1)
     new.submit("newer", "newer", time.time(), 1, Wish(priority=9))
@@ -61,11 +71,7 @@ def test_a_worker_leaves_jobs_of_a_newer_format_to_newer_workers(redis: Redis) -
 
 
 def test_a_frame_stays_with_the_version_that_planned_it(redis: Redis) -> None:
-    queue = Queue(redis, LEASE)
-    queue.submit("job", "job", time.time(), 1, Wish())
-    task = queue.claim(OLD)
-    assert task
-    queue.complete(task, OLD.name, plan("1"))
+    queue = planned_by_old(redis, plan("1"))
     assert queue.claim(NEW) is None
     parts = []
     while task := queue.claim(OTHER_OLD):
@@ -78,11 +84,7 @@ def test_a_frame_stays_with_the_version_that_planned_it(redis: Redis) -> None:
 
 
 def test_a_failed_attempt_is_not_left_waiting_for_workers_of_another_version(redis: Redis) -> None:
-    queue = Queue(redis, LEASE)
-    queue.submit("job", "job", time.time(), 1, Wish())
-    task = queue.claim(OLD)
-    assert task
-    queue.complete(task, OLD.name, Planned(tasks=1, finished=[], total=1, samples=0, version="1"))
+    queue = planned_by_old(redis, Planned(tasks=1, finished=[], total=1, samples=0, version="1"))
     for attempt in (1, 2, 3):
         queue.claim(NEW)
         task = queue.claim(OLD)
@@ -93,11 +95,7 @@ def test_a_failed_attempt_is_not_left_waiting_for_workers_of_another_version(red
 
 
 def test_a_frame_whose_version_is_gone_is_planned_anew(redis: Redis) -> None:
-    queue = Queue(redis, LEASE)
-    queue.submit("job", "job", time.time(), 1, Wish())
-    task = queue.claim(OLD)
-    assert task
-    queue.complete(task, OLD.name, plan("1"))
+    queue = planned_by_old(redis, plan("1"))
     task = queue.claim(OLD)
     assert task
     queue.complete(task, OLD.name, Rendered(samples=10))

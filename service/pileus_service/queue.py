@@ -350,7 +350,8 @@ def _job_view(
     left = None
     gained = settled - int(held["restored"])
     if state is JobState.RUNNING and gained > 0:
-        left = (now - int(held["started"]) / 1000) * (frames - settled) / gained
+        worked = now - (int(held["started"]) + int(held.get("idle", 0))) / 1000
+        left = worked * (frames - settled) / gained
     first = min(failed, key=int) if failed else None
     return JobView(
         id=job,

@@ -4,6 +4,7 @@ Run in the project's folder; all that it makes is under demo/.
 """
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pileus_core as core
@@ -33,15 +34,17 @@ PANELS = (
 
 
 def shot(name: str, *settings: str) -> Shot:
-    """The example's shot, smaller and into the demo's folder."""
+    """The example's shot, smaller, denoised where that can be, and into the demo's folder."""
+    denoise = find_spec("pyoidn") is not None
     return load_shot(
         SHOT,
         [
             f"name={name}",
             f"frames='{FRAMES}'",
             "image.width=640",
-            "sampling.samples=8",
             "image.height=360",
+            f"image.denoise={str(denoise).lower()}",
+            "sampling.samples=8",
             f"image.output='{FOLDER}/frames/{name}.####.exr'",
             f"volumes.0.cache='{FOLDER}/caches/cumulus.####.vdb'",
             *settings,

@@ -16,8 +16,11 @@ local function drop_frames()
 end
 
 if verb == 'pause' and state == 'running' then
+  redis.call('HSET', key, 'paused', now())
   set_state(job, 'paused') -- claims put its tasks aside as they meet them
 elseif verb == 'resume' and state == 'paused' then
+  local started, paused = unpack(redis.call('HMGET', key, 'started', 'paused'))
+  if started and paused then redis.call('HINCRBY', key, 'idle', now() - paused) end
   set_state(job, 'running')
   for _, held in ipairs(redis.call('LRANGE', key .. ':held', 0, -1)) do
     local task = cjson.decode(held)

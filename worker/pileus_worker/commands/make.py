@@ -35,28 +35,20 @@ Length = Annotated[
 Out = Annotated[str, typer.Argument(metavar="OUT", help="The files, as caches/cloud.####.vdb.")]
 
 
-@app.command()
-def cloud(
-    out: Out,
-    frames: Frames = "1-24",
-    resolution: Resolution = 256,
-    seed: Seed = 0,
-    length: Length = None,
-) -> None:
-    """A fractal cumulus that drifts and billows."""
-    make("cloud", out, frames, resolution, seed, length)
+def _command(subject: Subject, what: str) -> None:
+    @app.command(subject, help=what)
+    def command(
+        out: Out,
+        frames: Frames = "1-24",
+        resolution: Resolution = 256,
+        seed: Seed = 0,
+        length: Length = None,
+    ) -> None:
+        make(subject, out, frames, resolution, seed, length)
 
 
-@app.command()
-def whitewater(
-    out: Out,
-    frames: Frames = "1-24",
-    resolution: Resolution = 256,
-    seed: Seed = 0,
-    length: Length = None,
-) -> None:
-    """A breaking splash with spray."""
-    make("whitewater", out, frames, resolution, seed, length)
+_command("cloud", "A fractal cumulus that drifts and billows.")
+_command("whitewater", "A breaking splash with spray.")
 
 
 def make(
