@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -220,6 +221,19 @@ def test_a_cancelled_render_stops_within_two_seconds(client: Client, real_shot: 
     while any(worker.task for worker in client.workers()):
         assert time.monotonic() - begun < 2.0
         time.sleep(0.05)
+
+
+def test_a_render_child_has_limits(farm: EmbeddedFarm, client: Client, real_shot: Shot) -> None:
+    finish(client, client.submit(real_shot).job.id)
+    workers = [worker.pid for worker in client.workers() if worker.alive]
+    children = [child for worker in workers for child in _descendants(worker)]
+    assert children
+    for child in children:
+        limits = Path(f"/proc/{child}/limits").read_text()
+        for name in ("cpu time", "data size", "file size", "core file size"):
+            soft = re.search(rf"Max {name} +(\S+)", limits)
+            assert soft is not None
+            assert soft[1] != "unlimited", name
 
 
 def test_a_frame_that_cannot_be_rendered_fails_alone_with_the_reason(

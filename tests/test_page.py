@@ -15,6 +15,7 @@ from pileus_service.app import create_app
 from pileus_service.auth import Guard
 from pileus_service.client import Client
 from pileus_service.farm import Farm
+from pileus_service.pages import PAGES
 from pileus_service.queue import Queue
 from pileus_service.roots import Roots
 from pileus_service.shot import Shot
@@ -30,8 +31,9 @@ def client(redis: Redis, tmp_path: Path) -> TestClient:
     return TestClient(create_app(farm, Guard(None)), base_url="http://127.0.0.1")
 
 
-def test_the_page_is_whole_by_itself_and_can_be_fed_no_script(client: TestClient) -> None:
-    answer = client.get("/")
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_is_whole_by_itself_and_can_be_fed_no_script(client: TestClient, page: str) -> None:
+    answer = client.get(page)
     policy = answer.headers["content-security-policy"]
     assert "default-src 'none'" in policy
     assert "unsafe" not in policy
@@ -60,11 +62,28 @@ def test_the_page_asks_only_what_the_api_answers(client: TestClient) -> None:
         assert any(re.fullmatch(path, address) for path in answered), address
 
 
-@pytest.mark.slow
-def test_the_page_shows_a_job_in_a_browser(tmp_path: Path, shot: dict[str, Any]) -> None:
+def dom(page: str, folder: Path) -> str:
+    """What a browser makes of a page, which must have nothing to complain of."""
     browser = shutil.which("chromium")
     if browser is None:
         pytest.skip("no browser is here: apt-get install chromium")
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    command += ["--disable-background-networking", "--enable-logging=stderr"]
+    command += [f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=5000", page]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "CONSOLE" not in ended.stderr, ended.stderr
+    return ended.stdout
+
+
+@pytest.mark.slow
+def test_the_api_is_described_in_a_browser(tmp_path: Path) -> None:
+    with embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0") as farm:
+        page = dom(f"{farm.url}/docs", tmp_path)
+    assert "/v1/jobs/{job_id}" in page.replace("\u200b", "").replace("<wbr>", "")
+
+
+@pytest.mark.slow
+def test_the_page_shows_a_job_in_a_browser(tmp_path: Path, shot: dict[str, Any]) -> None:
     (tmp_path / "caches").mkdir()
     for frame in (1, 3):
         path = tmp_path / "caches" / f"cloud.{frame:04d}.vdb"
@@ -76,13 +95,7 @@ def test_the_page_shows_a_job_in_a_browser(tmp_path: Path, shot: dict[str, Any])
         Client(farm.url) as client,
     ):
         *_, job = client.watch(client.submit(named).job.id)
-        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
-        command += ["--disable-background-networking", "--enable-logging=stderr"]
-        command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000"]
-        command.append(f"{farm.url}/#{job.id}")
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert "CONSOLE" not in ended.stderr, ended.stderr
-    page = ended.stdout
+        page = dom(f"{farm.url}/#{job.id}", tmp_path)
     assert "<h1>&lt;b&gt;cirrus&lt;/b&gt;</h1>" in page
     grid = page[page.index('id="frames"') : page.index('class="key"')]
     assert re.findall(r'<button[^>]*class="(\w+)"', grid) == ["done", "failed", "done"]

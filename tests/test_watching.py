@@ -26,7 +26,9 @@ from pileus_service.client import Client
 from pileus_service.jobs import FrameMap, Job, JobState, JobView, Wish
 from pileus_service.shot import Shot
 from pileus_service.store import Store
-from pileus_worker.embedded import LOG_BYTES, EmbeddedFarm, Workers, embedded_farm
+from pileus_worker.embedded import EmbeddedFarm, Workers, embedded_farm
+from pileus_worker.logfile import LOG_BYTES
+from pileus_worker.private_redis import PrivateRedis
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
 
@@ -109,6 +111,14 @@ def test_the_workers_log_is_bounded(tmp_path: Path) -> None:
             writer.end()
     assert (tmp_path / "workers.old.log").stat().st_size > LOG_BYTES
     assert 0 < (tmp_path / "workers.log").stat().st_size < 10_000
+
+
+def test_redis_log_is_bounded(tmp_path: Path) -> None:
+    with PrivateRedis(tmp_path) as redis:
+        os.truncate(tmp_path / "redis.log", LOG_BYTES + 1)
+        redis.keep_up()
+    assert (tmp_path / "redis.old.log").stat().st_size > LOG_BYTES
+    assert b"Redis is now ready to exit" in (tmp_path / "redis.log").read_bytes()[:10_000]
 
 
 @settings(deadline=None)

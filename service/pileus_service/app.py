@@ -67,7 +67,9 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    app = FastAPI(title="Pileus", version=__version__, lifespan=lifespan)
+    app = FastAPI(
+        title="Pileus", version=__version__, lifespan=lifespan, docs_url=None, redoc_url=None
+    )
     problems.install(app)
     app.add_middleware(problems.BodyLimit, limit=MAX_BODY)
     app.add_middleware(SecurityHeaders)
@@ -81,28 +83,17 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
         return farm.workers()
 
     @app.post(
-        "/v1/workers/{name}/drain",
+        "/v1/workers/{name}/{verb}",
         status_code=204,
         dependencies=[Depends(guard)],
         tags=["farm"],
         responses=problems.RESPONSES,
     )
-    def drain(name: WorkerName) -> None:
-        """Gives the worker no more tasks; what it has in hand it finishes."""
+    def steer(name: WorkerName, verb: Literal["drain", "undrain"]) -> None:
+        """Drained, a worker gets no more tasks and finishes what it has in hand; undrained, it gets
+        tasks again, also where it was set aside."""
         _found(name in farm.queue.worker_names() or None, f"worker {name}")
-        farm.queue.drain(name)
-
-    @app.post(
-        "/v1/workers/{name}/undrain",
-        status_code=204,
-        dependencies=[Depends(guard)],
-        tags=["farm"],
-        responses=problems.RESPONSES,
-    )
-    def undrain(name: WorkerName) -> None:
-        """Gives tasks again to a worker that was drained or set aside."""
-        _found(name in farm.queue.worker_names() or None, f"worker {name}")
-        farm.queue.undrain(name)
+        getattr(farm.queue, verb)(name)
 
     @app.get(
         "/metrics",

@@ -6,13 +6,6 @@ After the OWASP HTTP Headers Cheat Sheet. No CORS header is ever sent: other sit
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-# The page of the API alone runs scripts: FastAPI's, from where FastAPI takes them.
-_PAGE = (
-    "default-src 'none'; connect-src 'self'; img-src 'self' data: https://fastapi.tiangolo.com; "
-    "script-src 'self' 'unsafe-inline' https://cdn.jsdelivr.net; "
-    "style-src 'self' 'unsafe-inline' https://cdn.jsdelivr.net; frame-ancestors 'none'"
-)
-_PAGES = ("/docs", "/redoc")
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "Cache-Control": "no-store",
@@ -34,8 +27,6 @@ class SecurityHeaders:
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                if scope["path"].startswith(_PAGES):
-                    headers["Content-Security-Policy"] = _PAGE
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)

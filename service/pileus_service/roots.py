@@ -6,17 +6,20 @@ since (openat with O_PATH and O_NOFOLLOW step by step, then /proc/self/fd, see p
 """
 
 import contextlib
+import errno
 import os
 import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pileus_service.errors import InputError
+from pileus_service.errors import FarmError, InputError
 from pileus_service.shot import Shot
 
 _STEP = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # Opens nothing: a FIFO would wait for a writer, and a device may act.
 _LOOK = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+# What keeps a folder from being made that no other shot would change.
+_DISK = {errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE}
 
 
 class Roots:
@@ -70,7 +73,7 @@ class Roots:
         """A location at which to write a file of a root, its folders made. A link that has the
         file's own name is to be replaced, not followed."""
         with contextlib.ExitStack() as held:
-            with _refusals(path):
+            with _refusals(path), _disk_troubles(path):
                 folder = self._folder(path, path.parent.resolve(), held, make=True)
             location = f"/proc/self/fd/{folder}/{path.name}"
             held.enter_context(_named(path, location))
@@ -106,8 +109,21 @@ def _refusals(path: Path) -> Iterator[None]:
     """A file that cannot be opened, or has become something else, is one line."""
     try:
         yield
+    except FarmError:
+        raise
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: {_reason(error)}") from None
+
+
+@contextlib.contextmanager
+def _disk_troubles(path: Path) -> Iterator[None]:
+    """A disk that is full or read-only is no wrong input."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISK:
+            raise
+        raise FarmError(f"{path}: {_reason(error)}") from None
 
 
 @contextlib.contextmanager

@@ -163,6 +163,8 @@ def test_a_disk_that_is_mended_takes_the_frames_it_refused(
         told = "no space left" if trouble == "full" else "read-only file system"
         assert told in (view.reason or "").lower()
         assert all(worker.aside is None for worker in farm.queue.workers())
+        told = httpx.get(f"http://{farm.listen}/metrics").text
+        assert 'pileus_attempt_failures_total{cause="input"} 0.0' in told
         kept = parts(farm, job)
         if trouble == "full":
             (out / "ballast").unlink()

@@ -205,6 +205,8 @@ def test_every_answer_has_the_security_headers(farm: Farm, path: str) -> None:
     policy = answer.headers["Content-Security-Policy"]
     assert policy.startswith("default-src 'none'")
     assert "frame-ancestors 'none'" in policy
+    assert "http" not in policy
+    assert "unsafe" not in policy
     assert ("script-src" in policy) == (path == "/docs")
 
 

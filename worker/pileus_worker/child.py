@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 TICK = 0.1
 NICE = 5
+FILE_BYTES = 64 << 30
+TASK_CPU_SECONDS = 6 * 3600  # of each thread
 
 
 @dataclass(frozen=True)
@@ -134,10 +136,19 @@ def _outcome(work: "Work", spent: Callable[[], Spent]) -> Finished | Failed:
 
 def _limit(setup: Setup) -> None:
     """The parent looks at our memory now and then; this stops what grows faster than it looks.
-    Stacks and code are not rendering's, so there is some room beyond."""
+    Stacks and code are not rendering's, so there is some room beyond. A file that grows without end
+    fails as on a full disk."""
     most = setup.memory_bytes + (512 << 20) + setup.threads * (16 << 20)
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_BYTES, FILE_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _limit_task(threads: int) -> None:
+    """Gives the task that begins its processor time: one that never ends dies, whatever it tells
+    its parent. The limit is the process's, which has others behind it."""
+    most = int(time.process_time()) + threads * TASK_CPU_SECONDS
+    resource.setrlimit(resource.RLIMIT_CPU, (most, resource.RLIM_INFINITY))
 
 
 class Life:
@@ -170,6 +181,7 @@ class Life:
             if isinstance(message, Order):
                 self._permitted.clear()
                 self._denied = False
+                _limit_task(self._setup.threads)
                 self._work = self._begin(message)
                 self._executor.submit(self._do, self._work)
             elif isinstance(message, Permit):

@@ -2,8 +2,6 @@
 
 import contextlib
 import fcntl
-import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -18,9 +16,8 @@ from pileus_service.server import bind, make_server
 from pileus_worker import machine
 from pileus_worker.commands.worker import TASK_SECONDS
 from pileus_worker.lifeline import die_with_parent
+from pileus_worker.logfile import keep_bounded
 from pileus_worker.private_redis import PrivateRedis
-
-LOG_BYTES = 64 << 20
 
 
 class Workers:
@@ -36,12 +33,7 @@ class Workers:
         self._processes = [
             process if process.poll() is None else self._start() for process in self._processes
         ]
-        if os.fstat(self._log.fileno()).st_size > LOG_BYTES:
-            # They append to the open file: it is emptied in place, its lines kept once more.
-            path = Path(self._log.name)
-            with contextlib.suppress(OSError):  # on a full disk the farm matters more
-                shutil.copyfile(path, path.with_suffix(".old.log"))
-            os.ftruncate(self._log.fileno(), 0)
+        keep_bounded(Path(self._log.name))
 
     def end(self) -> None:
         """Tells all to end, and sees to it."""

@@ -17,7 +17,9 @@ from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_fixe
 from pileus_service.errors import FarmError
 from pileus_service.queue import UNREACHABLE
 from pileus_worker.lifeline import die_with_parent
+from pileus_worker.logfile import keep_bounded
 
+LOG = "redis.log"
 NO_PASSWORD_FITS = "#" + 64 * "0"
 
 
@@ -51,6 +53,7 @@ class PrivateRedis:
 
     def keep_up(self) -> None:
         """Starts it again if it has died; it reads its file, and what that lacks is on disk."""
+        keep_bounded(self._folder / LOG)
         if self._process is not None and self._process.poll() is not None:
             self._start()
 
@@ -65,7 +68,7 @@ class PrivateRedis:
             "unixsocket": str(self._socket),
             "unixsocketperm": "700",
             "dir": str(self._folder.resolve()),
-            "logfile": "redis.log",
+            "logfile": LOG,
         }
         words = [word for key, value in options.items() for word in (f"--{key}", value)]
         self._process = subprocess.Popen(
@@ -85,7 +88,7 @@ class PrivateRedis:
     )
     def _answers(self) -> None:
         if self._process is not None and self._process.poll() is not None:
-            raise FarmError(f"redis-server ended at once; see {self._folder / 'redis.log'}")
+            raise FarmError(f"redis-server ended at once; see {self._folder / LOG}")
         with Redis.from_url(self.url) as client:
             client.ping()
 
