@@ -40,6 +40,7 @@ class Setup:
     cache_bytes: int
     memory_bytes: int
     task_seconds: float
+    stall_seconds: float
     paths: PathMap
 
 

@@ -100,6 +100,9 @@ class Child:
         self._process.start()
         theirs.close()
         self._heard = time.monotonic()
+        # Until its first word it reads its program, which on a busy machine or a slow network takes
+        # as long as any reading may.
+        self._silence = setup.stall_seconds
 
     def order(self, order: child.Order) -> None:
         self._heard = time.monotonic()
@@ -117,12 +120,14 @@ class Child:
         try:
             if self._pipe.poll(seconds):
                 message: child.Message = self._pipe.recv()
-                self._heard = time.monotonic()
+                self._heard, self._silence = time.monotonic(), SILENCE
                 return message
         except (EOFError, OSError):
             raise ChildLostError(self._how_it_ended()) from None
-        if time.monotonic() - self._heard > SILENCE:
-            raise ChildLostError(f"the render process hung: silent for {SILENCE:.0f} s", Cause.HANG)
+        if time.monotonic() - self._heard > self._silence:
+            raise ChildLostError(
+                f"the render process hung: silent for {self._silence:.0f} s", Cause.HANG
+            )
         return None
 
     def cancel(self) -> bool:
@@ -180,6 +185,7 @@ class Supervisor:
             limits.cache_bytes,
             limits.memory_bytes,
             limits.task_seconds,
+            limits.stall_seconds,
             paths,
         )
         host = socket.gethostname()
