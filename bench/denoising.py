@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pileus_service.shot import Shot
 from pileus_service.shotfile import load_shot
-from pileus_worker import machine, scene
+from pileus_worker import deciding, machine, scene
 from pileus_worker.denoising import Filter, Pixels, guide_of
 
 Stack = NDArray[np.float64]  # (frames, height, width, 3)
@@ -30,14 +30,18 @@ class Frames:
 
     def __init__(self, shot: Shot) -> None:
         self._shot = shot
-        self._scenes = {
-            frame: scene.make_scene(
-                shot,
-                frame,
-                core.Volume(str(scene.cache_path(shot, frame)), shot.volumes[0].density),
-            )
+        volumes = {
+            frame: core.Volume(str(scene.cache_path(shot, frame)), shot.volumes[0].density)
             for frame in shot.frame_numbers
         }
+        self._scenes = {
+            frame: scene.make_scene(shot, frame, volume) for frame, volume in volumes.items()
+        }
+        first = shot.frame_numbers[0]
+        resolved = deciding.resolve(
+            shot, first, lambda: volumes[first], threads=0, control=core.Control()
+        )
+        self._transport = scene.make_transport(shot, resolved)
 
     def render(self, samples: int, seed: int, moving: bool = True) -> list[Pixels]:
         """RGBA of each frame; where it is not `moving`, all frames have the noise of the first."""
@@ -48,7 +52,7 @@ class Frames:
             whole.add(
                 core.render(
                     view,
-                    scene.make_transport(self._shot),
+                    self._transport,
                     bucket=(0, 0, *size),
                     samples=(0, samples),
                     seed=seed,

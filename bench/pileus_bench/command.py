@@ -26,6 +26,7 @@ from pileus_worker.errors import plain_errors
 
 app = typer.Typer()
 
+SHARED = Path("../shared/data")
 SMALL = Plan(budgets=(0.2, 0.8), repeats=3, truth_noise=1e-3, truth_seconds=20.0, scale=0.5)
 FULL = Plan(budgets=(0.5, 2.0, 8.0), repeats=3, truth_noise=2e-4, truth_seconds=240.0, scale=1.0)
 
@@ -49,7 +50,7 @@ def chart(
     ] = None,
     shared: Annotated[
         Path, typer.Option(metavar="DIR", help="Real caches, where there are any.")
-    ] = Path("../shared/data"),
+    ] = SHARED,
     page: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Writes a page about it, with --out.")
     ] = None,
@@ -66,7 +67,7 @@ def chart(
     _check_outputs(out, page)
     plan = FULL if full else SMALL
     plan = replace(plan, repeats=repeats or plan.repeats)
-    data = (data or _cache_folder()).resolve()
+    data = (data or cache_folder()).resolve()
     chosen = _chosen(scenes, scene_names(), "--scenes")
     names = _chosen(only, list(core.METHODS), "--methods")
     ours = [each for each in methods() if each.name in names]
@@ -158,7 +159,7 @@ def _chosen(asked: str | None, known: list[str], option: str) -> list[str]:
     return names
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "pileus" / "chart"
 
 

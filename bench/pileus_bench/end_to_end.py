@@ -53,7 +53,7 @@ def end_to_end(
         scene = replace(scene, shot=scene.shot.model_copy(update={"image": image}))
         view = view_of(scene, scene.frames[0], data)
         renderer.load(view)
-        truth, _ = truth_of(view, renderer, TRUTH_NOISE, TRUTH_SECONDS, data)
+        truth, _ = truth_of(view, renderer.render, TRUTH_NOISE, TRUTH_SECONDS, data)
 
         def theirs(samples: int, view: dict[str, object] = view) -> tuple[Image, Spent]:
             with RendererProcess(CYCLES_DENOISED.renderer, python) as process:

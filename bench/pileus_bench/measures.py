@@ -80,6 +80,11 @@ def errors(renders: Sequence[tuple[Sequence[Image], Truth]]) -> Errors:
     )
 
 
+def error(image: Image, truth: Truth) -> float:
+    """The relMSE of one render without the truth's noise."""
+    return float(np.mean(_error_maps([image], truth)))
+
+
 def trimmed_error(image: Image, truth: Truth) -> float:
     """The relMSE of one render without its worst pixels and without the truth's noise."""
     return float(np.mean(_trim([image], truth)))

@@ -115,7 +115,7 @@ class Measurement:
     def _truth(self, scene: BenchScene, frame: int, view: dict[str, Any]) -> Truth:
         plan = self._plan
         truth, samples = truth_of(
-            view, self._processes["pileus"], plan.truth_noise, plan.truth_seconds, self._data
+            view, self._processes["pileus"].render, plan.truth_noise, plan.truth_seconds, self._data
         )
         self.truths.append(
             TruthRecord(scene=scene.name, frame=frame, samples=samples, noise=truth.noise)

@@ -2,23 +2,26 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pileus_core as core
 
-from pileus_bench.measures import Truth
-from pileus_bench.process import RendererProcess
+from pileus_bench.measures import Image, Truth
+from pileus_bench.process import Spent
 
 REFERENCE = {"transport": {"method": "reference", "max_bounces": None}}
 PILOT = 16
 MOST_SAMPLES = 1 << 18
 SEEDS = (1_000_001, 1_000_002)
 
+Render = Callable[[dict[str, Any], int, int], tuple[Image, Spent]]
+
 
 def truth_of(
-    view: dict[str, Any], renderer: RendererProcess, noise: float, most_seconds: float, data: Path
+    view: dict[str, Any], render: Render, noise: float, most_seconds: float, data: Path
 ) -> tuple[Truth, int]:
     """The two halves and the samples of each. The renderer has loaded the view.
 
@@ -31,13 +34,13 @@ def truth_of(
         return Truth(held["a"].astype(np.float64), held["b"].astype(np.float64)), int(
             held["samples"]
         )
-    pilots = [renderer.render(REFERENCE, PILOT, seed) for seed in SEEDS]
+    pilots = [render(REFERENCE, PILOT, seed) for seed in SEEDS]
     pilot = Truth(pilots[0][0], pilots[1][0])
     seconds = sum(spent.cpu_seconds for _, spent in pilots)
     wanted = PILOT * pilot.noise / noise
     samples = int(min(wanted, PILOT * most_seconds / seconds, MOST_SAMPLES))
     if samples > PILOT:
-        a, b = (renderer.render(REFERENCE, samples, seed)[0] for seed in SEEDS)
+        a, b = (render(REFERENCE, samples, seed)[0] for seed in SEEDS)
         truth = Truth(a, b)
     else:
         truth, samples = pilot, PILOT

@@ -296,8 +296,11 @@ NB_MODULE(_core, m) {
         .def_prop_ro("looks", [](const Partial& p) { return p.image.looks(); })
         .def_ro("identity", &Partial::identity)
         .def_ro("bounded_paths", &Partial::bounded_paths, "Paths that the bound on work has ended.")
-        .def("relative_error", &Partial::relative_error,
-             "The RMS relative error of its pixels, from their variances.")
+        .def(
+            "relative_error", &Partial::relative_error,
+            "The RMS relative error of its pixels for their noise, one standard error more than it "
+            "seems to be.")
+        .def_prop_ro("opacity", &Partial::opacity, "The mean of 1 - transmittance.")
         .def(
             "channels",
             [](const Partial& p, const std::string& look) {
@@ -390,18 +393,21 @@ NB_MODULE(_core, m) {
     m.def(
         "render_until",
         [](const Scene& scene, const Transport& transport, const BucketTuple& bucket, int samples,
-           double tolerance, std::uint64_t seed, int frame, bool orders, int threads,
-           Control* control) {
+           double tolerance, double opacity, std::uint64_t seed, int frame, bool orders,
+           int threads, Control* control) {
             Control own;
             const RenderTask task{to_bucket(bucket), {0, samples}, seed, frame, orders};
             const nb::gil_scoped_release release;
-            return render_until(scene, transport, task, tolerance, threads,
+            return render_until(scene, transport, task, tolerance, opacity, threads,
                                 control ? *control : own);
         },
-        "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "tolerance"_a, "seed"_a,
-        "frame"_a, "orders"_a = false, "threads"_a = 0, "control"_a.none() = nb::none(),
-        "Renders a bucket until the RMS relative error of its pixels is at most `tolerance`, with "
-        "at most `samples` a pixel. Raises InputError, Cancelled.");
+        "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "tolerance"_a,
+        "opacity"_a, "seed"_a, "frame"_a, "orders"_a = false, "threads"_a = 0,
+        "control"_a.none() = nb::none(),
+        "Renders a bucket until it does its share for a frame of the mean opacity `opacity` that "
+        "may "
+        "have the RMS relative error `tolerance`, with at most `samples` a pixel. Raises "
+        "InputError, Cancelled.");
 
     m.def(
         "read_image",

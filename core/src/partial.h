@@ -42,10 +42,15 @@ struct Partial {
     /// Throws InputError for a file that is truncated, altered or no partial.
     static Partial read(const std::string& path);
 
-    /// The RMS relative error of its pixels, from their variances, of the look where it is
-    /// greatest: the root of the mean over pixels and RGB of variance / (mean^2 + 0.01), with the
-    /// means of small blocks.
+    /// The RMS relative error of its pixels for their noise, of the look where it is greatest: the
+    /// root of the mean over pixels and RGB of variance / (mean^2 + 0.01), plus one standard error.
+    /// The variance is told by each pixel's samples, which know nothing of their stratification,
+    /// and by how unlike its neighbours a pixel is, which takes detail for noise: both err upwards,
+    /// and the smaller counts. Infinite for one sample of fewer than 3x3 pixels.
     double relative_error() const;
+
+    /// The mean over pixels of 1 - transmittance.
+    double opacity() const;
 
     /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
     void pool(const Partial& other);

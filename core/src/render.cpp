@@ -7,7 +7,7 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
-#include <bit>
+#include <cmath>
 
 namespace pileus {
 
@@ -165,20 +165,25 @@ Partial render(const Scene& scene, const Transport& transport, const RenderTask&
 }
 
 Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
-                     double tolerance, int threads, Control& control) {
-    // The first round is long enough for a variance over the bucket; each later one adds half or a
-    // third, so that hardly more is taken than is needed, and a round's end splits no Sobol net
-    // into odd parts.
-    constexpr int first_round = 4;
+                     double tolerance, double opacity, int threads, Control& control) {
+    // What is shared out evenly, for noise that has nothing to do with opacity, as of a sky's
+    // texture at the pixels' edges; where there is none, the frame's error is so much smaller.
+    constexpr double even = 0.1;
     if (!(tolerance > 0.0)) throw InputError("the tolerance must be positive");
+    if (!(opacity > 0.0)) throw InputError("the frame's opacity must be positive");
     RenderTask round = task;
-    round.samples = {0, std::min(first_round, task.samples.last)};
+    round.samples = {0, 1};
     Partial partial = render(scene, transport, round, threads, control);
-    while (partial.samples.last < task.samples.last && partial.relative_error() > tolerance) {
+    while (partial.samples.last < task.samples.last) {
         const int taken = partial.samples.last;
-        const int next =
-            std::has_single_bit(static_cast<unsigned>(taken)) ? taken / 2 * 3 : taken / 3 * 4;
-        round.samples = {taken, std::min(next, task.samples.last)};
+        const double share = even + (1.0 - even) * partial.opacity() / opacity;
+        const double error = partial.relative_error() / tolerance;
+        const double excess = error * error / share;
+        if (!(excess > 1.0)) break;
+        // As many as seem to be needed; few samples do not know it well.
+        const double next = std::min(
+            {std::ceil(excess * taken), 4.0 * taken, static_cast<double>(task.samples.last)});
+        round.samples = {taken, static_cast<int>(next)};
         partial.pool(render(scene, transport, round, threads, control));
     }
     return partial;

@@ -34,10 +34,12 @@ struct RenderTask {
 Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
                Control& control);
 
-/// Renders the task in rounds of growing length until the pixels' RMS relative error, as their own
-/// variances tell it, is at most `tolerance` in every look, or all of the task's samples are taken.
-/// Samples begin at 0; the partial says how many there are, and they are those that `render` takes.
+/// Renders the task in rounds until the bucket does its share for a frame that may have the RMS
+/// relative error `tolerance` and has the mean opacity `opacity`, or all of the task's samples are
+/// taken. A bucket may err by as much of it as it has of the opacity: where there is only sky there
+/// is no noise, and the rest may have more. Samples begin at 0; the partial says how many there
+/// are, and they are those that `render` takes.
 Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
-                     double tolerance, int threads, Control& control);
+                     double tolerance, double opacity, int threads, Control& control);
 
 }  // namespace pileus

@@ -50,6 +50,44 @@ std::string refusal(const std::function<void()>& action) {
     return "";
 }
 
+/// A bucket of one look whose every pixel is `level` and noise of so much variance, which its
+/// samples take for `told`; `detail` is added to and taken from the pixels by turns.
+Partial noisy(double level, double variance, double told, double detail = 0.0) {
+    Partial partial = make_partial({0, 0, width, height}, {0, 4}, "shot", {"beauty"});
+    Random random(7);
+    for (std::size_t c = 0; c < 3; ++c) {
+        for (std::size_t i = 0; i < partial.image.window().pixels(); ++i) {
+            // Uniform, of variance 1.
+            const double noise = std::sqrt(12.0) * (double{random.uniform()} - 0.5);
+            const double sign = (i % width + i / width) % 2 == 0 ? 1.0 : -1.0;
+            partial.image.plane(0, Partial::r + c)[i] =
+                static_cast<float>(level + sign * detail + std::sqrt(variance) * noise);
+            partial.image.plane(0, Partial::variance_r + c)[i] = static_cast<float>(told);
+        }
+    }
+    return partial;
+}
+
+TEST(Partial, TellsItsErrorBySamplesOrNeighboursWhicheverSaysLess) {
+    const double level = 2.0, variance = 0.01;
+    const double exact = std::sqrt(variance / (level * level + 0.01));
+    // Samples that know nothing of their stratification say too much, and so does detail. One
+    // standard error, here of 54 blocks, comes on top.
+    EXPECT_NEAR(noisy(level, variance, variance).relative_error(), exact, 0.05 * exact);
+    EXPECT_NEAR(noisy(level, variance, 9 * variance).relative_error(), exact, 0.15 * exact);
+    EXPECT_NEAR(noisy(level, variance, variance, 0.5).relative_error(), exact, 0.05 * exact);
+    EXPECT_GT(noisy(level, variance, 9 * variance, 0.5).relative_error(), 2 * exact);
+}
+
+TEST(Partial, OfOneSampleTellsItsErrorByNeighboursAlone) {
+    Partial partial = noisy(2.0, 0.01, 0.0);
+    partial.samples = {0, 1};
+    const double exact = std::sqrt(0.01 / 4.01);
+    EXPECT_NEAR(partial.relative_error(), exact, 0.15 * exact);
+    partial.image = LayeredImage({0, 0, 2, 1}, {"beauty"}, channel_names(0));
+    EXPECT_TRUE(std::isinf(partial.relative_error()));
+}
+
 TEST(Frame, PlanMustTileTheImage) {
     EXPECT_NE(refusal([] { Frame(width, height, {{left, 16}}); }), "");
     EXPECT_NE(refusal([] { Frame(width, height, {{left, 16}, {left, 16}, {right, 8}}); }), "");

@@ -108,8 +108,9 @@ class Resolved(Record):
     method: str
     max_bounces: int | None
     reduce_from: int
-    # The RMS relative error at which a bucket takes no more samples; None takes them all.
+    # The RMS relative error that the frame's noise may have; None takes all samples.
     noise: float | None = None
+    opacity: float = 1.0  # the frame's mean, by which its buckets share that error out
     reason: str
 
 

@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from pileus_service.jobs import Bucket, Resolved
 from pileus_service.shot import Shot
-from pileus_worker import scene
+from pileus_worker import planning, scene
 
 PILOT_PIXELS = 1024
-PILOT_SHARE = 0.02  # of the pixel samples that the frame may take
+PILOT_SHARE = 0.04  # of the pixel samples that the frame seems to need
+PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
+BLOCK = 4
 # The RMS bias of `similarity` by the event from which it reduces, as docs/methods.md measures it in
 # the worst case, a sun without sky.
 SIMILARITY_BIAS = {3: 0.020, 6: 0.013, 9: 0.011}
+Channels = dict[str, NDArray[np.float32]]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
 
@@ -31,9 +34,10 @@ HYSTERESIS = 1.25
 @dataclass(frozen=True)
 class Measure:
     """What a pilot tells: the RMS relative error of leaving out the orders from N on, N = 0 .. 32
-    (33 values, falling to 0), of the look where it is greatest."""
+    (33 values, falling to 0), of the look where it is greatest; and the frame's mean opacity."""
 
     tail: NDArray[np.float64]
+    opacity: float = 1.0
 
 
 def render(
@@ -69,12 +73,45 @@ def render(
         bucket=bucket,
         samples=samples[1],
         tolerance=resolved.noise,
+        opacity=resolved.opacity,
         seed=seed,
         frame=frame,
         orders=orders,
         threads=threads,
         control=control,
     )
+
+
+def render_frame(
+    view: core.Scene,
+    shot: Shot,
+    resolved: Resolved,
+    *,
+    frame: int,
+    threads: int,
+    control: core.Control,
+    done: Callable[[int], None] = lambda pixels: None,
+) -> core.Frame:
+    """All of a frame as it was decided; `done` hears of the pixels that are finished."""
+    size = (shot.image.width, shot.image.height)
+    samples, adaptive = shot.sampling.samples, resolved.noise is not None
+    buckets = planning.tiles(*size, planning.ADAPTIVE_EDGE if adaptive else max(size))
+    whole = core.Frame(*size, [(each, None if adaptive else samples) for each in buckets])
+    for bucket in buckets:
+        whole.add(
+            render(
+                view,
+                shot,
+                resolved,
+                frame=frame,
+                bucket=bucket,
+                samples=(0, samples),
+                threads=threads,
+                control=control,
+            )
+        )
+        done((bucket[2] - bucket[0]) * (bucket[3] - bucket[1]))
+    return whole
 
 
 def resolve(
@@ -89,10 +126,12 @@ def resolve(
 ) -> Resolved:
     """The transport of a frame; `earlier` is what was decided for the first one of the shot. The
     volume is asked for where the frame must be measured."""
-    asked = shot.transport
-    if asked.method == "auto":
-        measure = _pilot(shot, frame, volume(), threads, control, reading)
-        return decide(shot, measure, earlier)
+    asked, opacity = shot.transport, 1.0
+    if shot.sampling.tolerance is not None:
+        pilot = Pilot(shot, frame, volume(), threads, control, reading)
+        if asked.method == "auto":
+            return decide(shot, pilot.measure(), earlier)
+        opacity = pilot.opacity()
     depth = "the depth" if asked.max_bounces else "the method's own depth"
     return Resolved(
         method=asked.method,
@@ -101,111 +140,152 @@ def resolve(
         ).max_bounces,
         reduce_from=asked.reduce_from,
         noise=shot.sampling.tolerance,
+        opacity=opacity,
         reason=f"the shot names the method, with {depth}",
     )
 
 
-def _pilot(
-    shot: Shot,
-    frame: int,
-    volume: core.Volume,
-    threads: int,
-    control: core.Control,
-    reading: scene.Opener,
-) -> Measure:
-    """The frame rendered small, order by order."""
-    image = shot.image
-    shrink = math.sqrt(min(1.0, PILOT_PIXELS / (image.width * image.height)))
-    width, height = max(1, round(image.width * shrink)), max(1, round(image.height * shrink))
-    small = shot.model_copy(
-        update={"image": image.model_copy(update={"width": width, "height": height})}
-    )
-    allowed = PILOT_SHARE * image.width * image.height * shot.sampling.samples / (width * height)
-    partial = core.render(
-        scene.make_scene(small, frame, volume, reading),
-        core.Transport(method="similarity", max_bounces=PILOT_ORDERS, looks=scene.make_looks(shot)),
-        bucket=(0, 0, width, height),
-        samples=(0, int(min(max(4, allowed), 64))),
-        seed=shot.sampling.seed,
-        frame=frame,
-        orders=True,
-        threads=threads,
-        control=control,
-    )
-    return Measure(np.max([_tail(partial.channels(name)) for name in partial.looks], axis=0))
+class Pilot:
+    """The frame rendered small, order by order, as two independent halves: the products of theirs
+    have no noise in their mean."""
+
+    def __init__(
+        self,
+        shot: Shot,
+        frame: int,
+        volume: core.Volume,
+        threads: int,
+        control: core.Control,
+        reading: scene.Opener,
+    ) -> None:
+        image = shot.image
+        pixels = image.width * image.height
+        # Where the picture is itself small, each pixel of the pilot stands for sixteen of it.
+        shrink = math.sqrt(min(1 / 16, PILOT_PIXELS / pixels))
+        width, height = max(1, round(image.width * shrink)), max(1, round(image.height * shrink))
+        small = shot.model_copy(
+            update={"image": image.model_copy(update={"width": width, "height": height})}
+        )
+        self._shot, self._frame, self._threads, self._control = shot, frame, threads, control
+        self._size = (width, height)
+        self._share = PILOT_SHARE * pixels / (2 * width * height)  # of the frame's samples a pixel
+        self._scene = scene.make_scene(small, frame, volume, reading)
+        self._first = self._halves(1)
+
+    def opacity(self) -> float:
+        return _opacity(self._first)
+
+    def measure(self) -> Measure:
+        """After a first look of one sample, with as many as the frame's noise is worth."""
+        sampling, halves = self._shot.sampling, self._first
+        assert sampling.tolerance is not None  # the shot's own check
+        noise = max(half.relative_error() for half in halves)
+        wanted = min((noise / sampling.tolerance) ** 2, sampling.samples)
+        samples = int(min(self._share * wanted, PILOT_SAMPLES))
+        if samples > 1:
+            halves = self._halves(samples)
+        a, b = halves
+        tails = [_tail(a.channels(name), b.channels(name)) for name in a.looks]
+        return Measure(np.max(tails, axis=0), _opacity(halves))
+
+    def _halves(self, samples: int) -> tuple[core.Partial, core.Partial]:
+        def half(number: int) -> core.Partial:
+            return core.render(
+                self._scene,
+                core.Transport(
+                    method="similarity",
+                    max_bounces=PILOT_ORDERS,
+                    looks=scene.make_looks(self._shot),
+                ),
+                bucket=(0, 0, *self._size),
+                samples=(0, samples),
+                seed=self._shot.sampling.seed + number,
+                frame=self._frame,
+                orders=True,
+                threads=self._threads,
+                control=self._control,
+            )
+
+        return half(1), half(2)
 
 
-def _tail(channels: dict[str, NDArray[np.float32]]) -> NDArray[np.float64]:
-    squares = np.zeros(PILOT_ORDERS + 1)
-    for colour in "RGB":
-        whole = channels[colour].astype(np.float64)
-        rest = np.zeros_like(whole)
-        for order in reversed(range(PILOT_ORDERS)):
-            rest = rest + channels[f"order{order:02d}.{colour}"]
-            squares[order] += np.mean(rest**2 / (whole**2 + 0.01)) / 3
-    return np.sqrt(squares)
+def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
+    """The mean opacity of a frame, and no less than tells a bucket from another."""
+    return max(0.001, sum(half.opacity for half in halves) / 2)
+
+
+def _tail(a: Channels, b: Channels) -> NDArray[np.float64]:
+    """From the orders of two halves, in blocks of pixels: what is left out, and one standard error
+    more."""
+    whole = (_blocks(np.array([half[c] for half in (a, b) for c in "RGB"]))).mean(axis=0)
+    rest_a, rest_b = (_rests(half) for half in (a, b))
+    products = np.mean(rest_a * rest_b, axis=1) / (whole**2 + 0.01)
+    upper = products.mean(axis=(1, 2)) + products.std(axis=(1, 2)) / math.sqrt(whole.size)
+    falling = np.maximum.accumulate(upper[::-1])[::-1]
+    return np.append(np.sqrt(np.maximum(falling, 0.0)), 0.0)
+
+
+def _rests(half: Channels) -> NDArray[np.float64]:
+    """What the orders from N on bring, of shape (orders, 3, rows, columns) in blocks."""
+    names = [f"order{order:02d}" for order in range(PILOT_ORDERS)]
+    layers = _blocks(np.array([[half[f"{name}.{c}"] for c in "RGB"] for name in names]))
+    return np.asarray(np.cumsum(layers[::-1], axis=0)[::-1])
+
+
+def _blocks(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The means of blocks of pixels, the last two axes; those at the far edges are smaller."""
+    values = planes.astype(np.float64)
+    for axis in (-2, -1):
+        starts = range(0, planes.shape[axis], BLOCK)
+        counts = np.diff([*starts, planes.shape[axis]])
+        sums = np.add.reduceat(values, starts, axis)
+        values = np.asarray(sums / (counts[:, None] if axis == -2 else counts))
+    return values
 
 
 def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Resolved:
     """The smallest model whose shortfall is at most half of the tolerance."""
     tolerance = shot.sampling.tolerance
     assert tolerance is not None  # the shot's own check
-    held = earlier is not None and earlier.method == "single"
-    limit = tolerance / 2 * (HYSTERESIS if held else 1 / HYSTERESIS if earlier else 1.0)
-    if measure.tail[1] <= limit:
-        return Resolved(
-            method="single",
-            max_bounces=1,
-            reduce_from=shot.transport.reduce_from,
-            noise=_noise(tolerance, measure.tail[1]),
-            reason=f"single scattering leaves out {measure.tail[1]:.1%}, "
-            f"within half of the tolerance {tolerance:.1%}",
-        )
     depth, cut = _depth(measure, tolerance / 4, earlier)
     if shot.transport.max_bounces is not None and (
         depth is None or shot.transport.max_bounces < depth
     ):
         depth, cut = shot.transport.max_bounces, 0.0  # the shot's own wish is no error
-    reach = "all orders" if depth is None else f"{depth} orders"
     fits = [start for start, bias in SIMILARITY_BIAS.items() if bias <= tolerance / 2]
-    if shot.volumes[0].anisotropy > 0 and fits:
-        bias = SIMILARITY_BIAS[fits[0]]
-        return Resolved(
-            method="similarity",
-            max_bounces=depth,
-            reduce_from=fits[0],
-            noise=_noise(tolerance, cut, bias),
-            reason=f"{reach}: single scattering would leave out {measure.tail[1]:.1%}; "
-            f"similarity from event {fits[0]} errs by at most {bias:.1%}, "
-            f"within half of the tolerance {tolerance:.1%}",
-        )
-    why = "similarity errs by too much" if shot.volumes[0].anisotropy > 0 else "no lobe to reduce"
+    bias, reduce_from = 0.0, shot.transport.reduce_from
+    if depth == 1:
+        method, why = "reference", "nothing to reduce"
+    elif shot.volumes[0].anisotropy <= 0:
+        method, why = "reference", "no lobe to reduce"
+    elif not fits:
+        method, why = "reference", "similarity errs by too much"
+    else:
+        method, reduce_from = "similarity", fits[0]
+        bias = SIMILARITY_BIAS[reduce_from]
+        why = f"similarity from event {reduce_from} errs by at most {bias:.1%}"
+    reach = {None: "all orders", 1: "single scattering"}.get(depth, f"{depth} orders")
+    without = "" if depth == 1 else f"; single scattering would leave out {measure.tail[1]:.1%}"
     return Resolved(
-        method="reference",
+        method=method,
         max_bounces=depth,
-        reduce_from=shot.transport.reduce_from,
-        noise=_noise(tolerance, cut),
-        reason=f"{reach}: single scattering would leave out {measure.tail[1]:.1%}; "
-        f"{why} for the tolerance {tolerance:.1%}",
+        reduce_from=reduce_from,
+        noise=math.sqrt(tolerance**2 - cut**2 - bias**2),
+        opacity=measure.opacity,
+        reason=f"{reach}, which leaves out {cut:.1%}{without}; {why}, "
+        f"for the tolerance {tolerance:.1%}",
     )
 
 
 def _depth(measure: Measure, limit: float, earlier: Resolved | None) -> tuple[int | None, float]:
     """The fewest orders that leave out at most the limit, and what they leave out; None: all."""
-    if earlier is not None and earlier.method != "single":
+    if earlier is not None:
         kept = earlier.max_bounces
         if kept is not None and kept < PILOT_ORDERS and measure.tail[kept] <= limit * HYSTERESIS:
             return kept, float(measure.tail[kept])
         if kept is None and measure.tail[PILOT_ORDERS // 2] > limit / HYSTERESIS:
             return None, 0.0
-    for orders in range(2, PILOT_ORDERS // 2 + 1):
+    for orders in range(1, PILOT_ORDERS // 2 + 1):
         if measure.tail[orders] <= limit:
             return orders, float(measure.tail[orders])
     return None, 0.0
-
-
-def _noise(tolerance: float, *shortfalls: float) -> float:
-    """What is left for noise, with a margin for the scatter of its own estimate."""
-    margin = 0.9
-    left = tolerance**2 - sum(shortfall**2 for shortfall in shortfalls)
-    return margin * math.sqrt(left)

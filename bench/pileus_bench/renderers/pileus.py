@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import numpy as np
 import pileus_core as core
 
 from pileus_bench.renderers.protocol import Image, serve
 from pileus_service.shot import Shot
-from pileus_worker import deciding, scene
+from pileus_worker import deciding, machine, scene
+from pileus_worker.denoising import denoise
 
 
 class Pileus:
@@ -21,25 +21,27 @@ class Pileus:
         self._scene = scene.make_scene(self._shot, self._frame, volume)
 
     def render(self, settings: dict[str, Any], samples: int, seed: int) -> Image:
-        image = self._shot.image
-        asked = self._shot.transport.model_copy(update=settings["transport"])
-        shot = self._shot.model_copy(update={"transport": asked})
+        """With a `tolerance` no more samples than that takes; `denoise` filters the frame."""
+        shot, tolerance = self._shot, settings.get("tolerance")
+        shot = shot.model_copy(
+            update={
+                "transport": shot.transport.model_copy(update=settings["transport"]),
+                "sampling": shot.sampling.model_copy(
+                    update={"samples": samples, "seed": seed, "tolerance": tolerance}
+                ),
+                "image": shot.image.model_copy(update={"denoise": settings.get("denoise", False)}),
+            }
+        )
         threads, control = settings.get("threads", 0), core.Control()
-        resolved = deciding.resolve(
+        self.resolved = deciding.resolve(
             shot, self._frame, lambda: self._volume, threads=threads, control=control
         )
-        partial = core.render(
-            self._scene,
-            scene.make_transport(shot, resolved),
-            bucket=(0, 0, image.width, image.height),
-            samples=(0, samples),
-            seed=seed,
-            frame=self._frame,
-            threads=threads,
-            control=control,
+        frame = deciding.render_frame(
+            self._scene, shot, self.resolved, frame=self._frame, threads=threads, control=control
         )
-        channels = partial.channels(asked.looks[0].name)
-        return np.stack([channels[c] for c in "RGB"], axis=-1)
+        self.samples = frame.mean_samples
+        denoise(frame, shot, threads or machine.cores())
+        return frame.pixels(shot.transport.looks[0].name)[..., :3]
 
 
 if __name__ == "__main__":

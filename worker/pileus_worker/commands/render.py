@@ -1,6 +1,7 @@
 """`pileus render`: a shot, here and now, in this process."""
 
 import json
+import math
 import signal
 import sys
 import time
@@ -15,7 +16,7 @@ from pileus_service.jobs import Resolved
 from pileus_service.progress import Display, Row, duration
 from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files, load_shot
-from pileus_worker import deciding, machine, planning, scene
+from pileus_worker import deciding, machine, scene
 from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.errors import plain_errors
@@ -90,7 +91,7 @@ class Renderer:
                 f"frame {number}: {frame.bounded_paths} paths met the bound on work and were ended"
             )
         error, noise = frame.relative_error(), resolved.noise
-        if noise is not None and error > noise:
+        if noise is not None and error > 1.1 * noise:
             self._display.note(
                 f"frame {number}: warning: noise of {error:.2%} is over the {noise:.2%} that the "
                 "tolerance leaves it; raise sampling.samples"
@@ -102,7 +103,7 @@ class Renderer:
             "load_seconds": volume.load_seconds,
             "render_seconds": render_seconds,
             "samples": round(frame.mean_samples),
-            "error": error,
+            "error": error if math.isfinite(error) else None,
             "method": resolved.method,
             "max_bounces": resolved.max_bounces,
             "reason": resolved.reason,
@@ -127,7 +128,7 @@ class Renderer:
     def _render(
         self, number: int, volume: core.Volume, control: core.Control
     ) -> tuple[Resolved, core.Frame]:
-        shot, size = self._shot, (self._shot.image.width, self._shot.image.height)
+        shot = self._shot
         self._pixels_done = 0
         resolved = deciding.resolve(
             shot,
@@ -138,26 +139,19 @@ class Renderer:
             earlier=self._first,
         )
         self._first = self._first or resolved
-        view = scene.make_scene(shot, number, volume)
-        samples = shot.sampling.samples
-        adaptive = resolved.noise is not None
-        buckets = planning.tiles(*size, planning.ADAPTIVE_EDGE if adaptive else max(size))
-        frame = core.Frame(*size, [(each, None if adaptive else samples) for each in buckets])
-        for bucket in buckets:
-            frame.add(
-                deciding.render(
-                    view,
-                    shot,
-                    resolved,
-                    frame=number,
-                    bucket=bucket,
-                    samples=(0, samples),
-                    threads=self._threads,
-                    control=control,
-                )
-            )
-            self._pixels_done += (bucket[2] - bucket[0]) * (bucket[3] - bucket[1])
+        frame = deciding.render_frame(
+            scene.make_scene(shot, number, volume),
+            shot,
+            resolved,
+            frame=number,
+            threads=self._threads,
+            control=control,
+            done=self._count,
+        )
         return resolved, frame
+
+    def _count(self, pixels: int) -> None:
+        self._pixels_done += pixels
 
     def _show(self, index: int, number: int, samples: int) -> None:
         image, sampling = self._shot.image, self._shot.sampling
