@@ -14,7 +14,14 @@ from pileus_bench.run import Measurement, Plan
 from pileus_bench.scenes import AbsentError, dense, load_scene, scene_names
 from pileus_service.shotfile import load_shot
 
-TINY = Plan(budgets=(0.05,), repeats=3, truth_noise=1e-4, truth_seconds=2.0, scale=0.25)
+TINY = Plan(
+    budgets=(0.05,),
+    tolerances=(0.1,),
+    repeats=3,
+    truth_noise=1e-4,
+    truth_seconds=2.0,
+    scale=0.25,
+)
 
 
 @pytest.mark.parametrize(("bias", "noise", "truth_noise"), [(0.05, 0.1, 0.02), (0.0, 0.2, 0.05)])

@@ -1,5 +1,6 @@
 """`auto`: its promise against a quiet truth, the model it takes, its calm along a sequence."""
 
+import argparse
 import math
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pileus_bench import promise
+from pileus_bench.here import ready
+from pileus_bench.measures import error
+from pileus_bench.scenes import SHARED, scene_names
 from pileus_service.shot import Shot
 from pileus_worker import deciding, scene
 from pileus_worker.deciding import PILOT_ORDERS, Measure, decide
@@ -79,9 +84,25 @@ def test_the_tolerance_is_kept_by_the_smallest_model(
         view = scene.make_scene(ours, 1, field)
         frame = deciding.render_frame(view, ours, resolved, frame=1, threads=0, control=control)
         image = frame.pixels("beauty")[..., 0]
-        error = math.sqrt(np.mean((image - truth) ** 2 / (truth**2 + 0.01)))
-        within += error <= tolerance
+        rms = math.sqrt(np.mean((image - truth) ** 2 / (truth**2 + 0.01)))
+        within += rms <= tolerance
     assert within == len(SEEDS)
+
+
+@pytest.mark.slow
+def test_the_promise_holds_on_the_charts_scenes(tmp_path: Path) -> None:
+    """As `python -m pileus_bench.promise` prints it: five seeds, in 95 % of renders."""
+    asked = argparse.Namespace(
+        scenes=",".join(scene_names()), scale=0.5, data=tmp_path, shared=SHARED
+    )
+    settings = promise.AUTO | {"tolerance": 0.05}
+    held = [
+        error(renderer.timed(settings, promise.MOST_SAMPLES, seed)[0], truth) <= 0.05**2
+        for _, renderer, truth in ready(asked)
+        for seed in promise.SEEDS
+    ]
+    assert len(held) >= 9 * len(promise.SEEDS)
+    assert np.mean(held) >= 0.95
 
 
 def _beauty() -> core.Look:

@@ -19,16 +19,29 @@ from pileus_bench.page import write_page
 from pileus_bench.results import Bar, Chart, EndToEnd
 from pileus_bench.run import Measurement, Plan
 from pileus_bench.scaling import refinement, threads
-from pileus_bench.scenes import AbsentError, load_scene, scene_names
+from pileus_bench.scenes import SHARED, AbsentError, cache_folder, load_scene, scene_names
 from pileus_service.errors import InputError
 from pileus_worker import machine
 from pileus_worker.errors import plain_errors
 
 app = typer.Typer()
 
-SHARED = Path("../shared/data")
-SMALL = Plan(budgets=(0.2, 0.8), repeats=3, truth_noise=1e-3, truth_seconds=20.0, scale=0.5)
-FULL = Plan(budgets=(0.5, 2.0, 8.0), repeats=3, truth_noise=2e-4, truth_seconds=240.0, scale=1.0)
+SMALL = Plan(
+    budgets=(0.2, 0.8),
+    tolerances=(0.1, 0.05),
+    repeats=3,
+    truth_noise=1e-3,
+    truth_seconds=20.0,
+    scale=0.5,
+)
+FULL = Plan(
+    budgets=(0.5, 2.0, 8.0),
+    tolerances=(0.1, 0.05, 0.025),
+    repeats=3,
+    truth_noise=2e-4,
+    truth_seconds=240.0,
+    scale=1.0,
+)
 
 
 @app.command("chart")
@@ -69,7 +82,7 @@ def chart(
     plan = replace(plan, repeats=repeats or plan.repeats)
     data = (data or cache_folder()).resolve()
     chosen = _chosen(scenes, scene_names(), "--scenes")
-    names = _chosen(only, list(core.METHODS), "--methods")
+    names = _chosen(only, [each.name for each in methods()], "--methods")
     ours = [each for each in methods() if each.name in names]
     peers_python = str(python or _peers_python())
     pythons = {each.renderer: peers_python for each in PEERS} | {"pileus": sys.executable}
@@ -111,8 +124,9 @@ def chart(
             if out is not None and measurement.points:
                 _write(charted(), out, page)  # an hour's work may be cut short
         pileus = measurement.process("pileus")
-        bars.append(refinement(pileus, ours, plan, data))
-        bars.extend(threads(pileus, ours, plan, data))
+        fixed = [each for each in ours if not each.by_tolerance]
+        bars.append(refinement(pileus, fixed, plan.repeats, plan.scale, data))
+        bars.extend(threads(pileus, fixed, plan.repeats, plan.scale, data))
         if CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
             denoised.extend(end_to_end(pileus, peers_python, plan.scale, data, shared))
             bars.append(denoised_bar(denoised))
@@ -157,10 +171,6 @@ def _chosen(asked: str | None, known: list[str], option: str) -> list[str]:
         if name not in known:
             raise InputError(f"{option} {name}: not known; choose from {', '.join(known)}")
     return names
-
-
-def cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "pileus" / "chart"
 
 
 def _peers_python() -> Path:

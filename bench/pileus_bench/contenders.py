@@ -1,6 +1,7 @@
 """Who is measured: every method of Pileus, and the peers with their settings."""
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Any
 
 import pileus_core as core
@@ -14,6 +15,7 @@ class Contender:
     renderer: str
     settings: dict[str, Any] = field(default_factory=dict, hash=False)
     denoised: bool = False
+    by_tolerance: bool = False  # its budgets are tolerances, not core seconds
 
     @property
     def peer(self) -> bool:
@@ -21,10 +23,17 @@ class Contender:
 
 
 def methods() -> list[Contender]:
-    return [
-        Contender(name, "pileus", {"transport": {"method": name, "max_bounces": None}})
-        for name in core.METHODS
-    ]
+    """With `auto` last, and once more denoised where OIDN is installed."""
+
+    def settings(name: str, denoise: bool = False) -> dict[str, Any]:
+        return {"transport": {"method": name, "max_bounces": None}, "denoise": denoise}
+
+    fixed = [Contender(name, "pileus", settings(name)) for name in core.METHODS]
+    auto = [Contender("auto", "pileus", settings("auto"), by_tolerance=True)]
+    if find_spec("pyoidn") is not None:
+        denoised = settings("auto", denoise=True)
+        auto.append(Contender("auto + OIDN", "pileus", denoised, denoised=True, by_tolerance=True))
+    return fixed + auto
 
 
 def _cycles(name: str, biased: bool, denoise: bool) -> Contender:

@@ -8,11 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from pileus_bench.command import SHARED, cache_folder
 from pileus_bench.measures import Image, Truth
 from pileus_bench.process import Spent
 from pileus_bench.renderers.pileus import Pileus
-from pileus_bench.scenes import AbsentError, load_scene, scene_names, view_of
+from pileus_bench.scenes import (
+    SHARED,
+    AbsentError,
+    cache_folder,
+    load_scene,
+    scene_names,
+    view_of,
+)
 from pileus_bench.truths import truth_of
 
 TRUTH_NOISE, TRUTH_SECONDS = 3e-4, 60.0

@@ -22,10 +22,12 @@ class RendererError(FarmError):
 
 
 class Spent(BaseModel):
-    """Wall seconds, and the processor's over all threads of the process."""
+    """Wall seconds, and the processor's over all threads of the process; and the samples a pixel,
+    where they are not those that were asked for."""
 
     seconds: float
     cpu_seconds: float
+    samples: float | None = None
 
 
 class RendererProcess:

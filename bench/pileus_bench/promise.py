@@ -19,6 +19,7 @@ from pileus_bench.here import Here, parser, ready
 from pileus_bench.measures import Truth, error, errors
 
 SEEDS = range(1, 6)
+AUTO = {"transport": {"method": "auto", "max_bounces": None}}
 MOST_SAMPLES = 1 << 14
 PROBE_SAMPLES = 8
 STEP = 1.06  # between the counts of samples that are tried
@@ -109,10 +110,9 @@ def measure(name: str, renderer: Here, truth: Truth, tolerance: float) -> Outcom
         print(f"| {name} | no fixed choice keeps the tolerance |")
         return None
     fixed, samples = found
-    auto = {"transport": {"method": "auto", "max_bounces": None}, "tolerance": tolerance}
     seen, ours, theirs, counts = [], [], [], []
     for seed in SEEDS:
-        image, spent = renderer.timed(auto, MOST_SAMPLES, seed)
+        image, spent = renderer.timed(AUTO | {"tolerance": tolerance}, MOST_SAMPLES, seed)
         seen.append(math.sqrt(max(0.0, error(image, truth))))
         ours.append(spent.cpu_seconds)
         counts.append(renderer.samples)

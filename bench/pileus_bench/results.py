@@ -21,7 +21,8 @@ class TruthRecord(Record):
 
 
 class Point(Record):
-    """One contender at one budget on one scene, means over its frames.
+    """One contender at one budget on one scene, means over its frames. The budget is a tolerance
+    for `auto`, core seconds for all others.
 
     Errors are relMSE without the truth's noise; `trimmed` leaves the worst 0.1 % of pixels out.
     `seconds` are wall, `cpu_seconds` the processor's over all threads.

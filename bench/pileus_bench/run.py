@@ -26,9 +26,10 @@ MOST_SAMPLES = 1 << 16
 
 @dataclass(frozen=True)
 class Plan:
-    """How much to measure: budgets are core seconds a render."""
+    """How much to measure: budgets are core seconds a render, and tolerances for `auto`."""
 
     budgets: tuple[float, ...]
+    tolerances: tuple[float, ...]
     repeats: int
     truth_noise: float
     truth_seconds: float
@@ -42,6 +43,12 @@ class _Runs:
     images: list[list[Image]] = field(default_factory=list)
     spent: list[list[Spent]] = field(default_factory=list)
     samples: list[int] = field(default_factory=list)
+
+    def begin(self, samples: int) -> None:
+        """Begins a frame, with so many samples a pixel at most."""
+        self.images.append([])
+        self.spent.append([])
+        self.samples.append(samples)
 
 
 Runs = dict[tuple[Contender, float], _Runs]
@@ -90,7 +97,9 @@ class Measurement:
 
     def scene(self, scene: BenchScene, contenders: Sequence[Contender]) -> None:
         runs: Runs = {
-            (each, budget): _Runs() for each in contenders for budget in self._plan.budgets
+            (each, budget): _Runs()
+            for each in contenders
+            for budget in (self._plan.tolerances if each.by_tolerance else self._plan.budgets)
         }
         truths = []
         for frame in scene.frames:
@@ -126,7 +135,11 @@ class Measurement:
     def _calibrate(self, scene: BenchScene, runs: Runs) -> None:
         """Finds how many samples each contender's budgets buy, and begins a frame."""
         costs: dict[str, float] = {}
-        for contender in list(dict.fromkeys(contender for contender, _ in runs)):
+        for (contender, _), run in runs.items():
+            if contender.by_tolerance:
+                run.begin(MOST_SAMPLES)
+        fixed = (contender for contender, _ in runs if not contender.by_tolerance)
+        for contender in list(dict.fromkeys(fixed)):
             with self._forgiven(scene, contender.renderer, runs):
                 # Samples alone: a denoiser's time comes on top of what its budget buys.
                 settings = {**contender.settings, "denoise": False}
@@ -136,16 +149,16 @@ class Measurement:
                     _, probe = process.render(settings, PROBE_SAMPLES, 0)
                     costs[kind] = max(probe.cpu_seconds, 1e-4) / PROBE_SAMPLES
                 for budget in self._plan.budgets:
-                    run = runs[contender, budget]
-                    run.images.append([])
-                    run.spent.append([])
-                    run.samples.append(_samples(budget, costs[kind]))
+                    runs[contender, budget].begin(_samples(budget, costs[kind]))
 
     def _render_each(self, scene: BenchScene, runs: Runs, repeat: int) -> None:
-        for (contender, _), run in list(runs.items()):
+        for (contender, budget), run in list(runs.items()):
+            settings = dict(contender.settings)
+            if contender.by_tolerance:
+                settings["tolerance"] = budget
             with self._forgiven(scene, contender.renderer, runs):
                 image, spent = self._processes[contender.renderer].render(
-                    contender.settings, run.samples[-1], 1 + repeat
+                    settings, run.samples[-1], 1 + repeat
                 )
                 run.images[-1].append(image)
                 run.spent[-1].append(spent)
@@ -183,7 +196,10 @@ def _point(
         peer=contender.peer,
         denoised=contender.denoised,
         budget=budget,
-        samples=mean(run.samples),
+        samples=mean(
+            mean(asked if s.samples is None else s.samples for s in each)
+            for asked, each in zip(run.samples, run.spent, strict=True)
+        ),
         seconds=mean(median(s.seconds for s in each) for each in run.spent),
         cpu_seconds=mean(median(s.cpu_seconds for s in each) for each in run.spent),
         rel_mse=found.rel_mse,

@@ -1,6 +1,7 @@
 """The scenes: shot files, the caches that `caches.toml` says how to get, a frame made ready."""
 
 import json
+import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,12 @@ from pileus_service.shotfile import parse_shot
 from pileus_worker.scene import cache_path
 
 SCENES = Path(__file__).parent / "scenes"
+SHARED = Path("../shared/data")  # real caches, where there are any
+
+
+def cache_folder() -> Path:
+    """Where made caches and truths are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "pileus" / "chart"
 
 
 class Recipe(BaseModel):

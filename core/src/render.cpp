@@ -178,11 +178,13 @@ Partial render_until(const Scene& scene, const Transport& transport, const Rende
         const int taken = partial.samples.last;
         const double share = even + (1.0 - even) * partial.opacity() / opacity;
         const double error = partial.relative_error() / tolerance;
-        const double excess = error * error / share;
-        if (!(excess > 1.0)) break;
-        // As many as seem to be needed; few samples do not know it well.
-        const double next = std::min(
-            {std::ceil(excess * taken), 4.0 * taken, static_cast<double>(task.samples.last)});
+        // Few samples have met few of the rare bright paths and make too little of them: n count
+        // as n / (1 + 1 / n).
+        const double needed = error * error / share * taken;
+        const double wanted = std::ceil((needed + std::sqrt(needed * (needed + 4.0))) / 2.0);
+        if (!(wanted > taken)) break;
+        // From a round that is too short to know, not too far.
+        const double next = std::min({wanted, 4.0 * taken, double(task.samples.last)});
         round.samples = {taken, static_cast<int>(next)};
         partial.pool(render(scene, transport, round, threads, control));
     }

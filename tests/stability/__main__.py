@@ -7,9 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import pileus_core as core
-
-from stability.battery import FULL, Cell, Estimate, Stage, run
+from stability.battery import FULL, METHODS, Cell, Estimate, Stage, bounces, run
 from stability.hazards import HAZARDS, Hazard
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
@@ -23,11 +21,11 @@ def row(hazard: Hazard) -> Row:
         stage = Stage.of(hazard, Path(folder), FULL)
         truth = cache(stage.truth)
         cells = {}
-        for method in core.METHODS:
+        for method in METHODS:
             cell = run(stage, method)
             # The contrast approximation stands for every order.
-            bounces = core.Transport(method=method, looks=[core.Look(name="any")]).max_bounces
-            cells[method] = replace(cell, truth=truth(None if method == "contrast" else bounces))
+            orders = None if method == "contrast" else bounces(method)
+            cells[method] = replace(cell, truth=truth(orders))
             print(f"{hazard.name}: {method}", file=sys.stderr)
         return cells
 
@@ -59,10 +57,10 @@ def number(value: float, sign: bool = False) -> str:
 
 
 def table(rows: dict[str, Row], tell: Callable[[Cell], str]) -> Iterable[str]:
-    yield "| hazard | " + " | ".join(f"`{method}`" for method in core.METHODS) + " |"
-    yield "|---" * (len(core.METHODS) + 1) + "|"
+    yield "| hazard | " + " | ".join(f"`{method}`" for method in METHODS) + " |"
+    yield "|---" * (len(METHODS) + 1) + "|"
     for name, cells in rows.items():
-        yield f"| {name} | " + " | ".join(tell(cells[m]) for m in core.METHODS) + " |"
+        yield f"| {name} | " + " | ".join(tell(cells[m]) for m in METHODS) + " |"
 
 
 def held(rows: dict[str, Row]) -> Iterable[str]:

@@ -11,9 +11,24 @@ import numpy as np
 import pileus_core as core
 from numpy.typing import NDArray
 
+from pileus_service.shot import (
+    Camera,
+    DomeLight,
+    Image,
+    Look,
+    Sampling,
+    Shot,
+    Transport,
+    Volume,
+)
+from pileus_worker import deciding, scene
 from stability.hazards import BEAUTY, HALVES, PHYSICAL, Hazard, Light
 
 Pixels = NDArray[np.floating[Any]]
+
+METHODS = [*core.METHODS, "auto"]
+# What `auto` is asked for: more than most hazards meet with the samples they have.
+TOLERANCE = 0.1
 
 # Methods that do not promise to keep the furnace's energy, and what bounds them instead: the sum
 # over their orders, none of which is more than the furnace.
@@ -83,42 +98,71 @@ class Stage:
 
     def render(
         self,
-        transport: core.Transport,
+        method: str,
         samples: tuple[int, int],
         *,
+        looks: Sequence[Look] = PHYSICAL,
+        max_bounces: int | None = None,
         lights: Sequence[Light] | None = None,
         volume: core.Volume | None = None,
         threads: int = 1,
         seed: int = 1,
     ) -> core.Partial:
-        """The hazard's picture, or under other lights the same with a background."""
-        hazard, (width, height) = self.hazard, self.size
-        scene = core.Scene(
-            volume=volume or self.volume,
-            extinction=hazard.extinction,
-            albedo=(hazard.albedo,) * 3,
-            anisotropy=hazard.anisotropy,
-            camera=hazard.camera(),
-            lights=hazard.lights(self.folder) if lights is None else lights,
-            width=width,
-            height=height,
-            background=lights is not None,
-        )
-        return core.render(
-            scene,
-            transport,
-            bucket=(0, 0, width, height),
-            samples=samples,
-            seed=seed,
+        """The hazard's picture, or under other lights the same with a background. `auto` takes no
+        more samples than it wants."""
+        shot = self.shot(method, samples[1], looks, max_bounces, lights, seed)
+        volume = volume or self.volume
+        control = core.Control()
+        resolved = deciding.resolve(shot, 1, lambda: volume, threads=threads, control=control)
+        return deciding.render(
+            scene.make_scene(shot, 1, volume),
+            shot,
+            resolved,
             frame=1,
+            bucket=(0, 0, *self.size),
+            samples=samples,
             threads=threads,
+            control=control,
+        )
+
+    def shot(
+        self,
+        method: str,
+        samples: int,
+        looks: Sequence[Look],
+        max_bounces: int | None,
+        lights: Sequence[Light] | None,
+        seed: int,
+    ) -> Shot:
+        hazard, (width, height) = self.hazard, self.size
+        return Shot(
+            name="hazard",
+            frames="1",
+            image=Image(
+                width=width, height=height, output="hazard.exr", background=lights is not None
+            ),
+            volumes=(
+                Volume(
+                    cache="hazard.vdb",
+                    extinction=hazard.extinction,
+                    albedo=(hazard.albedo,) * 3,
+                    anisotropy=hazard.anisotropy,
+                ),
+            ),
+            camera=Camera(position=hazard.position, look_at=hazard.look_at, fov=hazard.fov),
+            lights=tuple(hazard.lights(self.folder) if lights is None else lights),
+            transport=Transport(method=method, max_bounces=max_bounces, looks=tuple(looks)),
+            sampling=Sampling(
+                samples=samples, seed=seed, tolerance=TOLERANCE if method == "auto" else None
+            ),
         )
 
     def truth(self, max_bounces: int | None) -> Estimate:
         """By `reference`, with numbers of its own."""
-        transport = core.Transport(method="reference", max_bounces=max_bounces, looks=PHYSICAL)
         count = self.share(self.detail.truth_paths)
-        return estimate(self.render(transport, (0, count), threads=0, seed=99))
+        return estimate(
+            self.render("reference", (0, count), max_bounces=max_bounces, threads=0, seed=99)
+        )
 
 
 def estimate(partial: core.Partial, look: str = BEAUTY) -> Estimate:
@@ -130,37 +174,49 @@ def estimate(partial: core.Partial, look: str = BEAUTY) -> Estimate:
     return Estimate(float(values.mean()), float(np.sqrt(variance.sum()) / values.size))
 
 
+def bounces(method: str) -> int | None:
+    """A method's own; None: unlimited."""
+    if method == "auto":
+        return None
+    bounces: int | None = core.Transport(method=method, looks=[core.Look(name="")]).max_bounces
+    return bounces
+
+
 def run(stage: Stage, method: str) -> Cell:
     """Renders a hazard with a method, and holds every guard against what comes."""
     hazard, count = stage.hazard, stage.samples
     # The contrast approximation is made for weights below one.
-    own = HALVES if method == "contrast" else PHYSICAL
-    transport = core.Transport(method=method, looks=[*own, *hazard.looks])
+    looks = [*(HALVES if method == "contrast" else PHYSICAL), *hazard.looks]
 
     begun = time.perf_counter()
-    partial = stage.render(transport, (0, count))
+    partial = stage.render(method, (0, count), looks=looks)
+    taken = partial.samples[1]
     seconds = time.perf_counter() - begun
     broken = [
         f"{look}: {trouble}"
         for look in partial.looks
-        for trouble in faults(partial.channels(look), count)
+        for trouble in faults(partial.channels(look), taken)
     ]
 
-    again = stage.render(transport, (0, count), volume=hazard.volume(stage.folder), threads=2)
+    again = stage.render(
+        method, (0, count), looks=looks, volume=hazard.volume(stage.folder), threads=2
+    )
     if not same_bits(partial, again):
         broken.append("other bits on another run")
 
-    white = [core.DomeLight(radiance=(1.0, 1.0, 1.0))]
-    physical = core.Transport(method=method, looks=PHYSICAL)
-    burnt = stage.render(physical, (0, count), lights=white)
+    burnt = stage.render(
+        method, (0, count), lights=[DomeLight(type="dome", radiance=(1.0, 1.0, 1.0))]
+    )
     furnace = estimate(burnt)
-    broken += [f"furnace: {trouble}" for trouble in faults(burnt.channels(BEAUTY), count)]
-    most = float(physical.max_bounces or 1) if method in MAY_CREATE_ENERGY else 1.0
+    broken += [
+        f"furnace: {trouble}" for trouble in faults(burnt.channels(BEAUTY), burnt.samples[1])
+    ]
+    most = float(bounces(method) or 1) if method in MAY_CREATE_ENERGY else 1.0
     if furnace.mean > most * (1 + 1e-4) + CHANCE * furnace.error:
         broken.append(f"the furnace has {furnace.mean:.4g}, and {most:g} is the most")
 
     picture = estimate(partial, BEAUTY)
-    paths = count * math.prod(stage.size)
+    paths = taken * math.prod(stage.size)
     return Cell(
         picture=picture,
         sigma=picture.error * math.sqrt(paths) / picture.mean if picture.mean else 0.0,

@@ -8,10 +8,12 @@ import numpy as np
 import pileus_core as core
 from numpy.typing import NDArray
 
+from pileus_service.shot import DistantLight, DomeLight, Look
+
 Vec3 = tuple[float, float, float]
 Field = NDArray[np.float32]
 Block = tuple[tuple[int, int, int], Field]
-Light = core.DistantLight | core.DomeLight
+Light = DistantLight | DomeLight
 
 SIDE = 32  # voxels along a cube of one world unit
 FAR = 1e6
@@ -19,11 +21,13 @@ FAR = 1e6
 
 def sun(towards: Vec3 = (0.4, 0.7, 0.6), irradiance: float = 3.0, angle: float = 0.0) -> Light:
     direction = (-towards[0], -towards[1], -towards[2])
-    return core.DistantLight(direction=direction, irradiance=(irradiance,) * 3, angle=angle)
+    return DistantLight(
+        type="distant", direction=direction, irradiance=(irradiance,) * 3, angle=angle
+    )
 
 
 def sun_and_sky(_: Path) -> list[Light]:
-    return [sun(), core.DomeLight(radiance=(0.3, 0.3, 0.3))]
+    return [sun(), DomeLight(type="dome", radiance=(0.3, 0.3, 0.3))]
 
 
 def straight_sun(_: Path) -> list[Light]:
@@ -49,13 +53,13 @@ def spiked_sky(folder: Path) -> list[Light]:
     path = folder / "spike.hdr"
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n"
     path.write_bytes(head.encode() + b"".join(texels))
-    return [core.DomeLight(radiance=(1.0, 1.0, 1.0), texture=str(path))]
+    return [DomeLight(type="dome", radiance=(1.0, 1.0, 1.0), texture=str(path))]
 
 
 BEAUTY = "beauty"
-PHYSICAL = (core.Look(name=BEAUTY),)
+PHYSICAL = (Look(name=BEAUTY),)
 # The weights that the authors of the contrast approximation use; with 1, 1, 1 its octaves only add.
-HALVES = (core.Look(name=BEAUTY, a=0.5, b=0.5, c=0.5),)
+HALVES = (Look(name=BEAUTY, a=0.5, b=0.5, c=0.5),)
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class Hazard:
     look_at: Vec3 = (0.0, 0.0, 0.0)
     fov: float = 35.0
     lights: Callable[[Path], list[Light]] = sun_and_sky
-    looks: tuple[core.Look, ...] = ()  # beside the physical one
+    looks: tuple[Look, ...] = ()  # beside the physical one
     size: tuple[int, int] | None = None  # where the picture's own size is the hazard
     samples: int | None = None  # where their number is
     dear: int = 1  # by how much a sample costs more than elsewhere
@@ -84,11 +88,6 @@ class Hazard:
         if not path.exists():
             core.write_grid(str(path), self.blocks(), voxel=self.voxel, origin=self.origin)
         return core.Volume(str(path))
-
-    def camera(self) -> core.Camera:
-        return core.Camera(
-            position=self.position, look_at=self.look_at, up=(0.0, 1.0, 0.0), fov=self.fov
-        )
 
 
 def radius() -> NDArray[np.float64]:
@@ -151,12 +150,12 @@ def slab() -> list[Block]:
 
 
 ZERO_LOOKS = (
-    core.Look(name="zero", a=0.0, b=0.0, c=0.0),
-    core.Look(name="a0", a=0.0),
-    core.Look(name="b0", b=0.0),
-    core.Look(name="c0", c=0.0),
-    core.Look(name="b_below_a", a=0.9, b=0.3, c=0.5),
-    core.Look(name="b_above_a", a=0.3, b=0.9, c=0.5),
+    Look(name="zero", a=0.0, b=0.0, c=0.0),
+    Look(name="a0", a=0.0),
+    Look(name="b0", b=0.0),
+    Look(name="c0", c=0.0),
+    Look(name="b_below_a", a=0.9, b=0.3, c=0.5),
+    Look(name="b_above_a", a=0.3, b=0.9, c=0.5),
 )
 
 HAZARDS = (

@@ -13,8 +13,8 @@ import pytest
 from pydantic import ValidationError
 
 from pileus_service.shot import Shot
-from stability.battery import FULL, SMALL, Detail, Stage, faults, run
-from stability.hazards import BEAUTY, HAZARDS, PHYSICAL, SIDE, Hazard, ball, damaged
+from stability.battery import FULL, METHODS, SMALL, Detail, Stage, faults, run
+from stability.hazards import BEAUTY, HAZARDS, SIDE, Hazard, ball, damaged
 
 BY_NAME = {hazard.name: hazard for hazard in HAZARDS}
 
@@ -28,7 +28,7 @@ def test_every_guard_holds_with_every_method(
     hazard: Hazard, detail: Detail, tmp_path: Path
 ) -> None:
     stage = Stage.of(hazard, tmp_path, detail)
-    broken = {method: run(stage, method).broken for method in core.METHODS}
+    broken = {method: run(stage, method).broken for method in METHODS}
     assert not {method: guards for method, guards in broken.items() if guards}
 
 
@@ -64,14 +64,13 @@ def test_the_bound_on_work_is_counted_and_told(tmp_path: Path) -> None:
 def test_samples_up_to_a_million_add_up_in_ranges(method: str, tmp_path: Path) -> None:
     """The last samples of 2^20, in ranges, are those of one range; none is like another."""
     stage = Stage.of(BY_NAME["1x1 image"], tmp_path, SMALL)
-    transport = core.Transport(method=method, looks=PHYSICAL)
     last, parts = 1 << 20, 4
     first = last - 256
-    whole = stage.render(transport, (first, last))
+    whole = stage.render(method, (first, last))
     assert not faults(whole.channels(BEAUTY), 256)
     step = (last - first) // parts
     ranges = [
-        stage.render(transport, (first + i * step, first + (i + 1) * step)) for i in range(parts)
+        stage.render(method, (first + i * step, first + (i + 1) * step)) for i in range(parts)
     ]
     values = [float(part.channels(BEAUTY)["G"][0, 0]) for part in ranges]
     assert len(set(values)) == parts
@@ -83,12 +82,11 @@ def test_samples_up_to_a_million_add_up_in_ranges(method: str, tmp_path: Path) -
 def test_a_million_samples_merge_into_one_pixel(method: str, tmp_path: Path) -> None:
     """Ranges of 2^18 give the image of all 2^20 at once, its variance too."""
     stage = Stage.of(BY_NAME["1x1 image"], tmp_path, SMALL)
-    transport = core.Transport(method=method, looks=PHYSICAL)
     last, step = 1 << 20, 1 << 18
     merged = core.Frame(1, 1, [((0, 0, 1, 1), last)])
     for first in range(0, last, step):
-        merged.add(stage.render(transport, (first, first + step)))
-    whole = stage.render(transport, (0, last)).channels(BEAUTY)
+        merged.add(stage.render(method, (first, first + step)))
+    whole = stage.render(method, (0, last)).channels(BEAUTY)
     for channel, value in zip("RGBA", merged.pixels(BEAUTY)[0, 0], strict=True):
         assert value == pytest.approx(float(whole[channel][0, 0]), rel=1e-6)
 
@@ -126,14 +124,13 @@ from pathlib import Path
 from stability.battery import SMALL, Stage
 from stability.hazards import HAZARDS
 from dataclasses import replace
-import pileus_core as core
+from pileus_service.shot import Look
 hazard = replace(next(h for h in HAZARDS if h.name == "wide bucket"), size=({width}, {height}))
 with tempfile.TemporaryDirectory() as folder:
     stage = Stage.of(hazard, Path(folder), SMALL)
-    looks = [core.Look(name=f"look{{i}}") for i in range({looks})]
-    transport = core.Transport(method="single", looks=looks)
+    looks = [Look(name=f"look{{i}}") for i in range({looks})]
     held = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    partial = stage.render(transport, (0, 1), lights=[])
+    partial = stage.render("single", (0, 1), looks=looks, lights=[])
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - held)
 """
     ended = subprocess.run(
@@ -186,5 +183,4 @@ def test_numbers_that_no_float_can_hold_are_refused(tmp_path: Path) -> None:
         refused("world units wide", lambda p=path: core.Volume(p))
     nearly_one = Hazard("", "", ball, anisotropy=1 - 1e-9)
     stage = Stage.of(nearly_one, tmp_path, SMALL)
-    transport = core.Transport(method="single", looks=PHYSICAL)
-    refused("anisotropy", lambda: stage.render(transport, (0, 1)))
+    refused("anisotropy", lambda: stage.render("single", (0, 1)))

@@ -1,7 +1,7 @@
 """Resolves a frame's transport: as the shot names it, or for `auto` by measuring the frame.
 
-The error that `sampling.tolerance` allows is shared out: at most half of it to what the model
-leaves out, the rest to noise. A pilot image of a thousand pixels tells how much each order of
+The error that `sampling.tolerance` allows is shared out: less than half of its square to what the
+model leaves out, the rest to noise. A pilot image of a thousand pixels tells how much each order of
 scattering brings; the model is then the smallest whose shortfall fits. Nothing rests on timings,
 so every machine decides alike.
 """
@@ -23,9 +23,11 @@ PILOT_SHARE = 0.04  # of the pixel samples that the frame seems to need
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
 BLOCK = 4
-# The RMS bias of `similarity` by the event from which it reduces, as docs/methods.md measures it in
-# the worst case, a sun without sky.
-SIMILARITY_BIAS = {3: 0.020, 6: 0.013, 9: 0.011}
+# The RMS bias of `similarity` under a sun alone, by the event from which it reduces, as
+# docs/methods.md measures it; under a plain sky alone it was never seen to be over SKY_BIAS.
+SIMILARITY_BIAS = {2: 0.037, 3: 0.027, 6: 0.025}
+SKY_BIAS = 0.005
+MOST_BIAS = 0.6  # of the tolerance: about a third of its square
 Channels = dict[str, NDArray[np.float32]]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
@@ -244,7 +246,7 @@ def _blocks(planes: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Resolved:
-    """The smallest model whose shortfall is at most half of the tolerance."""
+    """The smallest model whose shortfalls leave more than half of the tolerance's square."""
     tolerance = shot.sampling.tolerance
     assert tolerance is not None  # the shot's own check
     depth, cut = _depth(measure, tolerance / 4, earlier)
@@ -252,7 +254,9 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         depth is None or shot.transport.max_bounces < depth
     ):
         depth, cut = shot.transport.max_bounces, 0.0  # the shot's own wish is no error
-    fits = [start for start, bias in SIMILARITY_BIAS.items() if bias <= tolerance / 2]
+    share = _sun_share(shot)
+    biases = {start: max(SKY_BIAS, share * bias) for start, bias in SIMILARITY_BIAS.items()}
+    fits = [start for start, bias in biases.items() if bias <= MOST_BIAS * tolerance]
     bias, reduce_from = 0.0, shot.transport.reduce_from
     if depth == 1:
         method, why = "reference", "nothing to reduce"
@@ -262,7 +266,7 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         method, why = "reference", "similarity errs by too much"
     else:
         method, reduce_from = "similarity", fits[0]
-        bias = SIMILARITY_BIAS[reduce_from]
+        bias = biases[reduce_from]
         why = f"similarity from event {reduce_from} errs by at most {bias:.1%}"
     reach = {None: "all orders", 1: "single scattering"}.get(depth, f"{depth} orders")
     without = "" if depth == 1 else f"; single scattering would leave out {measure.tail[1]:.1%}"
@@ -275,6 +279,15 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         reason=f"{reach}, which leaves out {cut:.1%}{without}; {why}, "
         f"for the tolerance {tolerance:.1%}",
     )
+
+
+def _sun_share(shot: Shot) -> float:
+    """What of the light that a point in the open gets is suns'. A textured sky may hold one."""
+    suns = sum(max(light.irradiance) for light in shot.lights if light.type == "distant")
+    skies = [light for light in shot.lights if light.type == "dome"]
+    suns += sum(math.inf for sky in skies if sky.texture is not None)
+    sky = sum(4 * math.pi * min(sky.radiance) for sky in skies)
+    return 1.0 if math.isinf(suns) or suns + sky == 0 else suns / (suns + sky)
 
 
 def _depth(measure: Measure, limit: float, earlier: Resolved | None) -> tuple[int | None, float]:

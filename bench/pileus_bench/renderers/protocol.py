@@ -17,7 +17,8 @@ Image = NDArray[np.float32]
 
 
 class Renderer(Protocol):
-    """Renders one view at a time; what a view holds `scenes.view_of` says."""
+    """Renders one view at a time; what a view holds `scenes.view_of` says. One that stops by itself
+    has `samples`, the mean over pixels of its last image."""
 
     about: str  # name, version and whatever decides its speed
 
@@ -59,7 +60,7 @@ def _answer_to(asked: dict[str, Any], renderer: Renderer) -> dict[str, Any]:
         lambda: images.append(renderer.render(asked["settings"], asked["samples"], asked["seed"]))
     )
     np.save(asked["out"], images[0])
-    return spent
+    return spent | {"samples": getattr(renderer, "samples", asked["samples"])}
 
 
 def _timed(work: Callable[[], None]) -> dict[str, float]:
