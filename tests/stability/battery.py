@@ -214,6 +214,9 @@ def run(stage: Stage, method: str) -> Cell:
     most = float(bounces(method) or 1) if method in MAY_CREATE_ENERGY else 1.0
     if furnace.mean > most * (1 + 1e-4) + CHANCE * furnace.error:
         broken.append(f"the furnace has {furnace.mean:.4g}, and {most:g} is the most")
+    least = 1.0 - TOLERANCE - CHANCE * furnace.error
+    if method == "auto" and furnace.mean < least and not burnt.bounded_paths:
+        broken.append(f"the furnace has {furnace.mean:.4g}: the model is too small")
 
     picture = estimate(partial, BEAUTY)
     paths = taken * math.prod(stage.size)

@@ -19,13 +19,14 @@ from pileus_service.shot import Shot
 from pileus_worker import planning, scene
 
 PILOT_PIXELS = 1024
+FEWEST_PIXELS = 256
 PILOT_SHARE = 0.04  # of the pixel samples that the frame seems to need
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
 BLOCK = 4
 # The RMS bias of `similarity` under a sun alone, by the event from which it reduces, as
 # docs/methods.md measures it; under a plain sky alone it was never seen to be over SKY_BIAS.
-SIMILARITY_BIAS = {2: 0.037, 3: 0.027, 6: 0.025}
+SIMILARITY_BIAS = {2: 0.042, 3: 0.027, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
 Channels = dict[str, NDArray[np.float32]]
@@ -36,7 +37,7 @@ HYSTERESIS = 1.25
 @dataclass(frozen=True)
 class Measure:
     """What a pilot tells: the RMS relative error of leaving out the orders from N on, N = 0 .. 32
-    (33 values, falling to 0), of the look where it is greatest; and the frame's mean opacity."""
+    (33 values, falling), of the look where it is greatest; and the frame's mean opacity."""
 
     tail: NDArray[np.float64]
     opacity: float = 1.0
@@ -148,8 +149,8 @@ def resolve(
 
 
 class Pilot:
-    """The frame rendered small, order by order, as two independent halves: the products of theirs
-    have no noise in their mean."""
+    """The frame rendered small, as two independent halves: the products of theirs have no noise in
+    their mean."""
 
     def __init__(
         self,
@@ -163,14 +164,16 @@ class Pilot:
         image = shot.image
         pixels = image.width * image.height
         # Where the picture is itself small, each pixel of the pilot stands for sixteen of it.
-        shrink = math.sqrt(min(1 / 16, PILOT_PIXELS / pixels))
+        wanted = min(max(FEWEST_PIXELS, pixels / 16), PILOT_PIXELS)
+        shrink = math.sqrt(min(1.0, wanted / pixels))
         width, height = max(1, round(image.width * shrink)), max(1, round(image.height * shrink))
         small = shot.model_copy(
             update={"image": image.model_copy(update={"width": width, "height": height})}
         )
         self._shot, self._frame, self._threads, self._control = shot, frame, threads, control
         self._size = (width, height)
-        self._share = PILOT_SHARE * pixels / (2 * width * height)  # of the frame's samples a pixel
+        # Of the frame's samples a pixel, for each of two halves, whole and by order.
+        self._share = PILOT_SHARE * pixels / (4 * width * height)
         self._scene = scene.make_scene(small, frame, volume, reading)
         self._first = self._halves(1)
 
@@ -179,31 +182,36 @@ class Pilot:
 
     def measure(self) -> Measure:
         """After a first look of one sample, with as many as the frame's noise is worth."""
-        sampling, halves = self._shot.sampling, self._first
+        sampling, whole = self._shot.sampling, self._first
         assert sampling.tolerance is not None  # the shot's own check
-        noise = max(half.relative_error() for half in halves)
+        noise = max(half.relative_error() for half in whole)
         wanted = min((noise / sampling.tolerance) ** 2, sampling.samples)
-        samples = int(min(self._share * wanted, PILOT_SAMPLES))
+        samples = int(min(max(1.0, self._share * wanted), PILOT_SAMPLES))
         if samples > 1:
-            halves = self._halves(samples)
-        a, b = halves
-        tails = [_tail(a.channels(name), b.channels(name)) for name in a.looks]
-        return Measure(np.max(tails, axis=0), _opacity(halves))
+            whole = self._halves(samples)
+        layered = self._halves(samples, PILOT_ORDERS)
+        tails = [
+            _tail(
+                *((u.channels(name), v.channels(name)) for u, v in zip(whole, layered, strict=True))
+            )
+            for name in whole[0].looks
+        ]
+        return Measure(np.max(tails, axis=0), _opacity(whole))
 
-    def _halves(self, samples: int) -> tuple[core.Partial, core.Partial]:
+    def _halves(self, samples: int, orders: int | None = None) -> tuple[core.Partial, core.Partial]:
+        """With every order of scattering, or some of them each for itself, on the same paths."""
+
         def half(number: int) -> core.Partial:
             return core.render(
                 self._scene,
                 core.Transport(
-                    method="similarity",
-                    max_bounces=PILOT_ORDERS,
-                    looks=scene.make_looks(self._shot),
+                    method="similarity", max_bounces=orders, looks=scene.make_looks(self._shot)
                 ),
                 bucket=(0, 0, *self._size),
                 samples=(0, samples),
                 seed=self._shot.sampling.seed + number,
                 frame=self._frame,
-                orders=True,
+                orders=orders is not None,
                 threads=self._threads,
                 control=self._control,
             )
@@ -216,22 +224,24 @@ def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
     return max(0.001, sum(half.opacity for half in halves) / 2)
 
 
-def _tail(a: Channels, b: Channels) -> NDArray[np.float64]:
-    """From the orders of two halves, in blocks of pixels: what is left out, and one standard error
-    more."""
-    whole = (_blocks(np.array([half[c] for half in (a, b) for c in "RGB"]))).mean(axis=0)
-    rest_a, rest_b = (_rests(half) for half in (a, b))
-    products = np.mean(rest_a * rest_b, axis=1) / (whole**2 + 0.01)
-    upper = products.mean(axis=(1, 2)) + products.std(axis=(1, 2)) / math.sqrt(whole.size)
+def _tail(a: tuple[Channels, Channels], b: tuple[Channels, Channels]) -> NDArray[np.float64]:
+    """What is left out, from two halves, each whole and by order, in blocks of pixels; and two
+    standard errors more."""
+    images = np.array([whole[c] for whole, _ in (a, b) for c in "RGB"])
+    level = _blocks(images).mean(axis=0)
+    products = np.mean(_rests(*a) * _rests(*b), axis=1) / (level**2 + 0.01)
+    blocks = (1, 2)
+    upper = products.mean(blocks) + 2 * products.std(blocks) / math.sqrt(level.size)
     falling = np.maximum.accumulate(upper[::-1])[::-1]
-    return np.append(np.sqrt(np.maximum(falling, 0.0)), 0.0)
+    return np.asarray(np.sqrt(np.maximum(falling, 0.0)))
 
 
-def _rests(half: Channels) -> NDArray[np.float64]:
-    """What the orders from N on bring, of shape (orders, 3, rows, columns) in blocks."""
+def _rests(whole: Channels, layered: Channels) -> NDArray[np.float64]:
+    """What the orders from N on bring, N = 0 .. 32, of shape (33, 3, rows, columns) in blocks."""
     names = [f"order{order:02d}" for order in range(PILOT_ORDERS)]
-    layers = _blocks(np.array([[half[f"{name}.{c}"] for c in "RGB"] for name in names]))
-    return np.asarray(np.cumsum(layers[::-1], axis=0)[::-1])
+    layers = [[layered[f"{name}.{c}"] for c in "RGB"] for name in names]
+    layers.append([whole[c] - layered[c] for c in "RGB"])
+    return np.asarray(np.cumsum(_blocks(np.array(layers))[::-1], axis=0)[::-1])
 
 
 def _blocks(planes: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -249,7 +259,7 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
     """The smallest model whose shortfalls leave more than half of the tolerance's square."""
     tolerance = shot.sampling.tolerance
     assert tolerance is not None  # the shot's own check
-    depth, cut = _depth(measure, tolerance / 4, earlier)
+    depth, cut = _depth(measure, tolerance / 8, earlier)
     if shot.transport.max_bounces is not None and (
         depth is None or shot.transport.max_bounces < depth
     ):
@@ -274,7 +284,8 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         method=method,
         max_bounces=depth,
         reduce_from=reduce_from,
-        noise=math.sqrt(tolerance**2 - cut**2 - bias**2),
+        # Both shortfalls are light that is missing: they add up.
+        noise=math.sqrt(tolerance**2 - (cut + bias) ** 2),
         opacity=measure.opacity,
         reason=f"{reach}, which leaves out {cut:.1%}{without}; {why}, "
         f"for the tolerance {tolerance:.1%}",
