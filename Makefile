@@ -93,5 +93,12 @@ build/.built: $(CORE) $(VENV)/.system
 	cmake --build build --parallel $(JOBS)
 	@touch $@
 
+.PHONY: sanitize
+# The core's tests under the address and the undefined behaviour sanitizers; half an hour the first time.
+sanitize: $(VENV)/.system
+	cmake -S core -B build/address -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=address,undefined
+	cmake --build build/address --parallel $(JOBS)
+	ctest --test-dir build/address --output-on-failure --parallel $(JOBS)
+
 clean:
 	rm -rf $(VENV) build demo chart
