@@ -7,10 +7,24 @@
 #include <openvdb/io/io.h>
 
 #include <fstream>
+#include <istream>
 #include <string>
 #include <vector>
 
 namespace pileus {
+
+/// A file that gives each read whole or refuses it, with nothing put down: OpenVDB reads as many
+/// bytes as a file says into room for fewer, and looks afterwards whether that was right.
+class WholeReads : public std::filebuf {
+  public:
+    explicit WholeReads(const std::string& path);
+
+  protected:
+    std::streamsize xsgetn(char* to, std::streamsize count) override;
+
+  private:
+    std::streamoff size_ = 0;
+};
 
 /// An open file. Throws what OpenVDB throws, and std::ios_base::failure where the file ends amid
 /// what it promised.
@@ -39,8 +53,10 @@ class VdbReader : private openvdb::io::Archive {
 
     const Entry* find(const std::string& name) const;
     openvdb::GridBase::Ptr read(const Entry& entry);
+    void read_voxels(const Entry& entry);
 
-    std::ifstream file_;
+    WholeReads buffer_;
+    std::istream file_;
     openvdb::SharedPtr<openvdb::io::StreamMetadata> metadata_;
     std::vector<Entry> entries_;
 };
