@@ -35,19 +35,21 @@ class Lobe {
 /// starts from the same random numbers, so a look does not notice the others.
 class Shadow {
   public:
-    Shadow(const Medium& medium, const V3f& position, const V3f& direction, const Random& random)
-        : medium_(medium), ray_(medium.ray(position, direction)), random_(random) {}
+    Shadow(const Medium& medium, const V3f& position, const V3f& direction, float rate,
+           const Random& random)
+        : medium_(medium), ray_(medium.ray(position, direction)), rate_(rate), random_(random) {}
 
     float transmittance(float power) {
         if (power == power_) return transmittance_;
         power_ = power;
         Random random = random_;
-        return transmittance_ = ratio_track(medium_, ray_, power, random);
+        return transmittance_ = ratio_track(medium_, ray_, power, rate_, random);
     }
 
   private:
     const Medium& medium_;
     LocalRay ray_;
+    float rate_;
     Random random_;
     float power_ = 0.0f, transmittance_ = 1.0f;
 };
@@ -66,7 +68,9 @@ DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
       looks_(looks),
       tracked_(flights == Flights::tracked),
       all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
-                                        [](const Look& look) { return look.physical(); })) {}
+                                        [](const Look& look) { return look.physical(); })),
+      reach_(tracked_ ? bridge_length(scene.medium.phase().g()) : 0),
+      chains_(scene.lights.size()) {}
 
 void DirectLight::set_terms(int first, int last) {
     if (first == first_ && last == last_) return;
@@ -95,6 +99,8 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
     const Lobe lobe(phase, last > 1);
     Random event_stream = random.stream(light_stream, static_cast<std::uint64_t>(first));
     const float roulette = first == 0 ? 0.0f : event_stream.uniform();
+    // A path has one first event and many later ones, so there noise counts more and time less.
+    const float rate = first == 0 ? 2.0f : 1.0f;
     const auto asked = [&](float brightness) { return first == 0 ? 1.0f : chance(brightness); };
 
     for (const auto& light : scene_.lights) {
@@ -109,9 +115,9 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
                 hit ? lobe.density(event.direction, sample->direction) : 0.0f;
             float others = 0.0f;  // the inverse densities that the bridges weigh in
             if (!hit && bridged(first)) {
-                for (const float inverse : event.inverse_density) others += inverse;
+                others = event.choices.sums()[static_cast<std::size_t>(reach_)];
             }
-            Shadow shadow(onward, event.position, sample->direction, stream);
+            Shadow shadow(onward, event.position, sample->direction, rate, stream);
             for (const Term& term : terms_) {
                 const float rival = hit ? (term.walk ? seen : lobe_density) : 0.0f;
                 const float share = rival > 0.0f ? sample->density / (sample->density + rival)
@@ -136,7 +142,7 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        Shadow shadow(onward, event.position, direction, lobe_stream);
+        Shadow shadow(onward, event.position, direction, rate, lobe_stream);
         for (const Term& term : terms_) {
             if (term.walk) continue;
             const float scattered = term.phase.density(event.direction, direction) / density;
@@ -151,51 +157,54 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
 
 void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
                               PathRecord& record) {
+    if (n + 1 >= end || !bridged(n + 1)) return;
     const HenyeyGreenstein& phase = schedule_.at(n).phase();
-    if (!bridged(n + 1)) return;
     Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(n));
-    for (const auto& light : scene_.lights) {
-        if (light->can_be_hit()) continue;
-        Random stream(event_stream.bits());
-        const float u1 = stream.uniform(), u2 = stream.uniform();
-        const auto sample = light->sample(u1, u2);
-        if (!sample) continue;
-        // A chain of directions that grows from the light towards the event, by one for each
-        // length; and the inverse densities of all choices of which a bridge leaves one to be
-        // evaluated.
-        std::array<V3f, longest_bridge> chain;
-        V3f next = sample->direction;
-        float chain_inverse = 0.0f, last_density = 0.0f;
-        for (int length = 1; length <= longest_bridge && n + length < end && bridged(n + length);
+    for (std::size_t k = 0; k < scene_.lights.size(); ++k) {
+        if (scene_.lights[k]->can_be_hit()) continue;
+        const std::optional<Chain>& way = chain(k, n, random);
+        if (!way) continue;
+        const LightSample& light = way->light();
+        const auto earlier = event.choices.sums();
+        for (int length = 1; length <= reach_ && n + length < end && bridged(n + length);
              ++length) {
-            const float v1 = stream.uniform(), v2 = stream.uniform();
-            const V3f direction = phase.sample(next, v1, v2);
-            const float density = phase.density(direction, next);
-            if (length == 1) last_density = density;
-            chain[static_cast<std::size_t>(length - 1)] = next = direction;
-            chain_inverse += 1.0f / density;
-            float inverse = chain_inverse + 1.0f / phase.density(event.direction, direction);
-            for (int i = 0; i < longest_bridge - length; ++i)
-                inverse += event.inverse_density[static_cast<std::size_t>(i)];
-            const float odds = chance(4.0f * pi / inverse);
-            Random own(stream.bits());
-            if (own.uniform() >= odds) continue;
-            if (const auto arrival =
-                    fly(event, n, {chain.data(), static_cast<std::size_t>(length)}, own)) {
-                set_terms(n + length, n + length + 1);
-                Shadow shadow(schedule_.onward(n + length), arrival->position, sample->direction,
-                              own);
-                for (const Term& term : terms_) {
-                    const float scattered =
-                        term.phase.density(chain[0], sample->direction) / (last_density * inverse);
-                    record.add(
-                        term.look, term.order,
-                        arrival->weight * sample->radiance *
-                            (term.weight * scattered / odds * shadow.transmittance(term.power)));
-                }
+            // Of all choices of which a bridge leaves one to be evaluated.
+            const float inverse = way->inverse(length) +
+                                  1.0f / phase.density(event.direction, way->first(length)) +
+                                  earlier[static_cast<std::size_t>(reach_ - length)];
+            const float odds = chance((n == 0 ? 4.0f : 2.0f) * pi / inverse);
+            if (event_stream.uniform() >= odds) continue;
+            Random own(event_stream.bits());
+            const auto arrival = fly(event, n, way->directions(length), own);
+            if (!arrival) continue;
+            set_terms(n + length, n + length + 1);
+            Shadow shadow(schedule_.onward(n + length), arrival->position, light.direction, 1.0f,
+                          own);
+            for (const Term& term : terms_) {
+                const float scattered =
+                    term.phase.density(way->first(1), light.direction) * way->inverse(1) / inverse;
+                record.add(term.look, term.order,
+                           arrival->weight * light.radiance *
+                               (term.weight * scattered / odds * shadow.transmittance(term.power)));
             }
         }
     }
+}
+
+/// The bridges' directions into a light. Neighbouring events share them, for they cost as much to
+/// draw as all else about a bridge that is not taken.
+const std::optional<Chain>& DirectLight::chain(std::size_t light, int n, const PathRandom& random) {
+    constexpr int sharing = 4;
+    if (n % sharing == 0) {
+        Random stream =
+            random.stream(chain_stream, static_cast<std::uint64_t>(n) * chains_.size() + light);
+        const float u1 = stream.uniform(), u2 = stream.uniform();
+        const auto sample = scene_.lights[light]->sample(u1, u2);
+        chains_[light] =
+            sample ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, stream))
+                   : std::nullopt;
+    }
+    return chains_[light];
 }
 
 /// Where a path comes to that flies on from event n along the directions of a chain, its last
@@ -216,10 +225,7 @@ std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, int n,
 
 /// Whether light of event n's order also comes by bridges: where its lobe, and so those of the
 /// events before it, is the medium's own and narrow.
-bool DirectLight::bridged(int n) const {
-    constexpr float narrow = 0.5f;
-    return tracked_ && schedule_.plain(n) && schedule_.at(n).phase().g() > narrow;
-}
+bool DirectLight::bridged(int n) const { return reach_ > 0 && schedule_.plain(n); }
 
 void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float density, int n,
                              PathRecord& record) const {

@@ -2,6 +2,7 @@
 // light at a scatter event by Eq. 1.
 #pragma once
 
+#include "bridge.h"
 #include "random.h"
 #include "scene.h"
 #include "schedule.h"
@@ -14,7 +15,13 @@
 
 namespace pileus {
 
-enum StreamPurpose : std::uint64_t { walk_stream, light_stream, bridge_stream, stream_purposes };
+enum StreamPurpose : std::uint64_t {
+    walk_stream,
+    light_stream,
+    bridge_stream,
+    chain_stream,
+    stream_purposes
+};
 
 /// The random numbers of one path: stratified ones for its first dimensions, and independent
 /// streams named by what they are for, so that no part of a path can shift the numbers of another.
@@ -80,16 +87,12 @@ class PathRecord {
     std::vector<Color> radiance_;
 };
 
-/// How many events a bridge to a distant light may have of its own.
-constexpr int longest_bridge = 2;
-
 /// A scatter event: light that travels the path backwards comes along `direction`.
 struct ScatterEvent {
-    V3f position;   // local
-    V3f direction;  // world, unit: the way the walk arrived
-    Color weight;   // of the path up to here, this event's albedo included
-    // 1 / density of the choices of the last directions, this one's first; 0 where there was none.
-    std::array<float, longest_bridge> inverse_density{};
+    V3f position;             // local
+    V3f direction;            // world, unit: the way the walk arrived
+    Color weight;             // of the path up to here, this event's albedo included
+    RecentChoices choices{};  // of the directions up to here
 };
 
 /// How a method flies from event to event.
@@ -106,12 +109,10 @@ enum class Flights {
 /// Where flights are tracked, two more techniques find the same light with less noise:
 /// - the sky reaches a physical look (a = b = c = 1) by the walk itself as it leaves the medium, at
 ///   no cost (`add_escape`);
-/// - distant lights, which the narrow lobe of one event sees seldom and then brightly, are also
-///   reached by bridges (`add_bridges`): the last one or two directions of a path are drawn from
-///   the light's end, each about the one that follows it, rather than about the one before. Of the
-///   path's last three phase functions p one is then evaluated and the others sampled. Weighed by
-///   the balance heuristic (Veach 1997) every technique counts the same, the harmonic sum
-///   1 / (sum of 1 / p): it has a peak only where all of them do.
+/// - distant lights are also reached by bridges (`add_bridges`). Of a path's last phase functions p
+///   one is then evaluated and the others sampled. Weighed by the balance heuristic (Veach 1997)
+///   every technique counts the same, the harmonic sum 1 / (sum of 1 / p): it has a peak only where
+///   all of them do.
 class DirectLight {
   public:
     DirectLight(const Scene& scene, const Schedule& schedule, const std::vector<Look>& looks,
@@ -142,6 +143,7 @@ class DirectLight {
 
     void set_terms(int first, int last);
     bool bridged(int n) const;
+    const std::optional<Chain>& chain(std::size_t light, int n, const PathRandom& random);
     std::optional<ScatterEvent> fly(const ScatterEvent& from, int n, std::span<const V3f> chain,
                                     Random& random) const;
 
@@ -152,6 +154,8 @@ class DirectLight {
     bool all_walk_;
     int first_ = -1, last_ = -1;
     std::vector<Term> terms_;
+    int reach_;  // the most events of a bridge; 0 where there are none
+    std::vector<std::optional<Chain>> chains_;  // by light
 };
 
 }  // namespace pileus

@@ -56,15 +56,18 @@ inline std::optional<float> delta_track(const Medium& medium, const LocalRay& ra
 
 /// Ratio tracking (Novak et al. 2014): an unbiased estimate of T^power, for power in [0, 1]. The
 /// power scales the extinction inside the estimator, for E[T^a] is not E[T]^a, and the majorant
-/// with it: light that a look lets through easily is also cheap. Estimates below a tenth live on
+/// with it: light that a look lets through easily is also cheap. Collisions come at `rate`, at
+/// least 1, times the majorant: the more there are, the less noise. Estimates below a tenth live on
 /// with that chance.
-inline float ratio_track(const Medium& medium, const LocalRay& ray, float power, Random& random) {
+inline float ratio_track(const Medium& medium, const LocalRay& ray, float power, float rate,
+                         Random& random) {
     constexpr float small = 0.1f;
     if (power == 0.0f) return 1.0f;
     float transmittance = 1.0f;
-    track(medium, ray, power, random.exponential(), random,
+    track(medium, ray, rate * power, random.exponential(), random,
           [&](float t, const MajorantSegment& segment, float majorant) {
-              transmittance *= 1.0f - medium.extinction_tap(ray.at(t), segment, random) / majorant;
+              transmittance *=
+                  1.0f - medium.extinction_tap(ray.at(t), segment, random) / (rate * majorant);
               if (transmittance >= small) return false;
               transmittance = random.uniform() * small < transmittance ? small : 0.0f;
               return transmittance == 0.0f;

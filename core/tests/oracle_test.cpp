@@ -215,7 +215,7 @@ TEST(Sky, ASmallBrightSpotIsTheSameByWalkAndByShadowRays) {
                 scene,
                 test::transport_of("reference", {},
                                    {{"physical"}, {"near", 0.999999f, 0.999999f, 0.999999f}}),
-                64),
+                128),
             1e-4);
     }
 }

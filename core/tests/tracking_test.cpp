@@ -97,7 +97,8 @@ TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
             Random random(200 + r);
             std::vector<double> values;
             for (int i = 0; i < samples; ++i) {
-                values.push_back(ratio_track(*medium_, rays_[r], power, random));
+                const float rate = i % 2 == 0 ? 1.0f : 2.5f;
+                values.push_back(ratio_track(*medium_, rays_[r], power, rate, random));
             }
             const auto [mean, error] = test::estimate(values);
             const double limit = test::z_limit(0.9999, tests() * int(powers.size()));
@@ -117,7 +118,7 @@ TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
         Random random(17);
         std::vector<double> values;
         for (int i = 0; i < 100000; ++i) {
-            values.push_back(ratio_track(thick, along, power, random));
+            values.push_back(ratio_track(thick, along, power, 1.0f, random));
         }
         const auto [mean, error] = test::estimate(values);
         EXPECT_NEAR(mean, std::exp(-power * tau), test::z_limit(0.9999, tests()) * error);
@@ -130,8 +131,8 @@ TEST_F(TrackingTest, AMediumWithoutExtinctionIsNoObstacle) {
     Random random(1);
     for (const LocalRay& along : rays_) {
         EXPECT_FALSE(delta_track(clear, along, 0.0f, random));
-        EXPECT_EQ(ratio_track(clear, along, 1.0f, random), 1.0f);
-        EXPECT_EQ(ratio_track(*medium_, along, 1e-45f, random), 1.0f);
+        EXPECT_EQ(ratio_track(clear, along, 1.0f, 1.0f, random), 1.0f);
+        EXPECT_EQ(ratio_track(*medium_, along, 1e-45f, 1.0f, random), 1.0f);
     }
 }
 

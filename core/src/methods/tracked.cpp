@@ -49,10 +49,10 @@ class Tracked final : public Method {
                 record.bounded = bounded_;
                 return;
             }
-            event = {flight.at(*distance),
-                     direction,
-                     event.weight * medium.albedo(),
-                     {1.0f / density, event.inverse_density[0]}};
+            event.position = flight.at(*distance);
+            event.direction = direction;
+            event.weight *= medium.albedo();
+            event.choices.add(density);
             if (!survives(event.weight, walk)) return;
         }
     }

@@ -1,0 +1,85 @@
+// Bridges: the last directions of a path to a distant light, drawn from the light's end. The
+// narrow lobe of one event sees such a light seldom and then brightly; where each direction is
+// drawn about the one that follows it, the path ends in the light by construction, and one phase
+// function further back is left to be evaluated.
+#pragma once
+
+#include "light.h"
+#include "random.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <span>
+
+namespace pileus {
+
+/// How many events a bridge may have between the walk and the light.
+constexpr int longest_bridge = 12;
+
+/// How many are worth it under a phase function: until the directions that go back from the light
+/// have spread, their mean cosine to it g^n being small.
+inline int bridge_length(float g) {
+    constexpr float spread = 0.3f;
+    if (g <= spread) return 0;
+    return static_cast<int>(
+        std::min<float>(longest_bridge, std::ceil(std::log(spread) / std::log(g))));
+}
+
+/// The inverse densities of the directions that a walk chose last, the last one first; 0 before
+/// its first choice.
+class RecentChoices {
+  public:
+    void add(float density) {
+        std::shift_right(inverse_.begin(), inverse_.end(), 1);
+        inverse_[0] = 1.0f / density;
+    }
+
+    /// The sums of none, of the last one, of the last two, and so on.
+    std::array<float, longest_bridge + 1> sums() const {
+        std::array<float, longest_bridge + 1> result{};
+        for (std::size_t i = 0; i < inverse_.size(); ++i) result[i + 1] = result[i] + inverse_[i];
+        return result;
+    }
+
+  private:
+    std::array<float, longest_bridge> inverse_{};
+};
+
+/// Directions that lead from a walk into a distant light, as many of the last ones as a bridge has
+/// events.
+class Chain {
+  public:
+    Chain(const LightSample& light, const HenyeyGreenstein& phase, int length, Random random)
+        : light_(light) {
+        V3f next = light.direction;
+        float sum = 0.0f;
+        for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
+            const float u1 = random.uniform(), u2 = random.uniform();
+            direction_[i] = phase.sample(next, u1, u2);
+            sum += 1.0f / phase.density(direction_[i], next);
+            inverse_[i] = sum;
+            next = direction_[i];
+        }
+    }
+
+    const LightSample& light() const { return light_; }
+
+    /// The direction in which a bridge with so many events leaves the walk.
+    const V3f& first(int events) const { return direction_[static_cast<std::size_t>(events - 1)]; }
+
+    /// Its directions, the last before the light first.
+    std::span<const V3f> directions(int events) const {
+        return {direction_.data(), static_cast<std::size_t>(events)};
+    }
+
+    /// The inverse densities of its choices, summed.
+    float inverse(int events) const { return inverse_[static_cast<std::size_t>(events - 1)]; }
+
+  private:
+    LightSample light_;
+    std::array<V3f, longest_bridge> direction_;
+    std::array<float, longest_bridge> inverse_{};
+};
+
+}  // namespace pileus
