@@ -54,6 +54,37 @@ inline std::optional<float> delta_track(const Medium& medium, const LocalRay& ra
     return collided ? std::optional(distance) : std::nullopt;
 }
 
+/// A collision that is made to happen: somewhere along the ray, with the weight of the chance that
+/// it does.
+struct ForcedCollision {
+    float chance;  // an unbiased estimate of 1 - T, in [0, 1]; 0 where nothing was met
+    float distance;
+};
+
+/// Weighted delta tracking (Novak et al. 2018): at each tentative collision a part of the weight
+/// collides and the rest goes on. One of the collisions is kept, drawn by its part. Light and
+/// opacity where the medium is thin are then no longer a matter of all or nothing. When little is
+/// left it goes on as in delta tracking, all of it at once. Collisions come at `rate`, at least 1,
+/// times the majorant: the more there are, the less noise.
+inline ForcedCollision forced_track(const Medium& medium, const LocalRay& ray, float rate,
+                                    float first_flight, Random& random) {
+    constexpr float little = 0.1f;
+    ForcedCollision result{0.0f, 0.0f};
+    track(medium, ray, rate, first_flight, random,
+          [&](float t, const MajorantSegment& segment, float majorant) {
+              const float left = 1.0f - result.chance;
+              const float part =
+                  medium.extinction_tap(ray.at(t), segment, random) / (rate * majorant);
+              const bool whole = left < little;
+              if (whole && random.uniform() >= part) return false;
+              const float collided = whole ? left : left * part;
+              result.chance = whole ? 1.0f : result.chance + collided;
+              if (random.uniform() * result.chance < collided) result.distance = t;
+              return result.chance == 1.0f;
+          });
+    return result;
+}
+
 /// Ratio tracking (Novak et al. 2014): an unbiased estimate of T^power, for power in [0, 1]. The
 /// power scales the extinction inside the estimator, for E[T^a] is not E[T]^a, and the majorant
 /// with it: light that a look lets through easily is also cheap. Collisions come at `rate`, at

@@ -6,6 +6,7 @@
 #include "../tracking.h"
 #include "methods.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace pileus {
@@ -19,17 +20,18 @@ class Tracked final : public Method {
           schedule_(std::move(schedule)),
           bounded_(!transport.max_bounces),
           events_(schedule_.events(transport.max_bounces.value_or(most_events))),
+          first_rate_(first_rate(scene)),
           light_(scene, schedule_, transport.looks, Flights::tracked) {}
 
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         Random walk = random.stream(walk_stream);
-        LocalRay flight = *ray.volume;
-        auto distance = delta_track(scene_.medium, flight, -std::log1p(-random.first[2]), walk);
-        if (!distance) return;
-        record.opacity = 1.0f;
-        record.depth = (ray.entry_distance + *distance) * ray.depth_per_distance;
-
-        ScatterEvent event{flight.at(*distance), ray.direction, scene_.medium.albedo()};
+        const auto [opacity, depth] = forced_track(scene_.medium, *ray.volume, first_rate_,
+                                                   -std::log1p(-random.first[2]), walk);
+        if (opacity == 0.0f) return;
+        record.opacity = opacity;
+        record.depth = (ray.entry_distance + depth) * ray.depth_per_distance;
+        ScatterEvent event{ray.volume->at(depth), ray.direction, scene_.medium.albedo() * opacity};
+        if (!survives(event.weight, walk)) return;
         for (int n = 0;; ++n) {
             light_.add(event, n, n + 1, random, record);
             light_.add_bridges(event, n, events_, random, record);
@@ -39,8 +41,8 @@ class Tracked final : public Method {
             const V3f direction = phase.sample(event.direction, u1, u2);
             const float density = phase.density(event.direction, direction);
             const Medium& medium = schedule_.onward(n);
-            flight = medium.ray(event.position, direction);
-            distance = delta_track(medium, flight, walk.exponential(), walk);
+            const LocalRay flight = medium.ray(event.position, direction);
+            const auto distance = delta_track(medium, flight, walk.exponential(), walk);
             if (!distance) {
                 light_.add_escape(event, direction, density, n, record);
                 return;
@@ -61,7 +63,7 @@ class Tracked final : public Method {
     /// Russian roulette on weights that absorption has made small; a path without absorption is
     /// never ended.
     static bool survives(Color& weight, Random& random) {
-        constexpr float small = 0.25f;
+        constexpr float small = 0.1f;
         const float most = max_component(weight);
         if (most >= small) return true;
         if (random.uniform() * small >= most) return false;
@@ -69,10 +71,22 @@ class Tracked final : public Method {
         return true;
     }
 
+    /// How many tentative collisions a mean free path of a camera ray has: twice as many as delta
+    /// tracking, and more where the whole volume has few, up to the point where they cost as much
+    /// as all that follows.
+    static float first_rate(const Scene& scene) {
+        const auto bounds = scene.volume->world_bounds();
+        if (!bounds) return 1.0f;
+        const double thickness = scene.medium.majorant(scene.volume->tree().bounds().max) *
+                                 (bounds->second - bounds->first).length();
+        return static_cast<float>(std::clamp(4.0 / thickness, 2.0, 8.0));
+    }
+
     const Scene& scene_;
     Schedule schedule_;
     bool bounded_;  // whether only the bound on work ends a path
     int events_;
+    float first_rate_;  // of tentative collisions along a camera ray
     DirectLight light_;
 };
 
