@@ -31,7 +31,6 @@ class Tracked final : public Method {
         record.opacity = opacity;
         record.depth = (ray.entry_distance + depth) * ray.depth_per_distance;
         ScatterEvent event{ray.volume->at(depth), ray.direction, scene_.medium.albedo() * opacity};
-        if (!survives(event.weight, walk)) return;
         for (int n = 0;; ++n) {
             light_.add(event, n, n + 1, random, record);
             light_.add_bridges(event, n, events_, random, record);
@@ -63,7 +62,7 @@ class Tracked final : public Method {
     /// Russian roulette on weights that absorption has made small; a path without absorption is
     /// never ended.
     static bool survives(Color& weight, Random& random) {
-        constexpr float small = 0.1f;
+        constexpr float small = 0.25f;
         const float most = max_component(weight);
         if (most >= small) return true;
         if (random.uniform() * small >= most) return false;
@@ -79,7 +78,7 @@ class Tracked final : public Method {
         if (!bounds) return 1.0f;
         const double thickness = scene.medium.majorant(scene.volume->tree().bounds().max) *
                                  (bounds->second - bounds->first).length();
-        return static_cast<float>(std::clamp(4.0 / thickness, 2.0, 8.0));
+        return static_cast<float>(std::clamp(4.0 / thickness, 1.0, 8.0));
     }
 
     const Scene& scene_;
