@@ -64,8 +64,9 @@ struct ForcedCollision {
 /// Weighted delta tracking (Novak et al. 2018): at each tentative collision a part of the weight
 /// collides and the rest goes on. One of the collisions is kept, drawn by its part. Light and
 /// opacity where the medium is thin are then no longer a matter of all or nothing. When little is
-/// left it goes on as in delta tracking, all of it at once. Collisions come at `rate`, at least 1,
-/// times the majorant: the more there are, the less noise.
+/// left it goes on as in delta tracking, all of it at once; and a collision of little chance is
+/// made a seldom one of more. Collisions come at `rate`, at least 1, times the majorant: the more
+/// there are, the less noise.
 inline ForcedCollision forced_track(const Medium& medium, const LocalRay& ray, float rate,
                                     float first_flight, Random& random) {
     constexpr float little = 0.1f;
@@ -82,6 +83,8 @@ inline ForcedCollision forced_track(const Medium& medium, const LocalRay& ray, f
               if (random.uniform() * result.chance < collided) result.distance = t;
               return result.chance == 1.0f;
           });
+    if (result.chance < little)
+        result.chance = random.uniform() * little < result.chance ? little : 0.0f;
     return result;
 }
 

@@ -143,6 +143,7 @@ def _limit(setup: Setup) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_BYTES, FILE_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _limit_task(setup.threads)
 
 
 def _limit_task(threads: int) -> None:

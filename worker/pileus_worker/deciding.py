@@ -196,6 +196,10 @@ class Pilot:
             )
             for name in whole[0].looks
         ]
+        if any(half.bounded_paths for half in whole):
+            tails.append(
+                np.ones(PILOT_ORDERS + 1)
+            )  # what the bound on work cut off may be anything
         return Measure(np.max(tails, axis=0), _opacity(whole))
 
     def _halves(self, samples: int, orders: int | None = None) -> tuple[core.Partial, core.Partial]:

@@ -54,15 +54,15 @@ class Tracked final : public Method {
             event.direction = direction;
             event.weight *= medium.albedo();
             event.choices.add(density);
-            if (!survives(event.weight, walk)) return;
+            if (!survives(event.weight, opacity, walk)) return;
         }
     }
 
   private:
-    /// Russian roulette on weights that absorption has made small; a path without absorption is
-    /// never ended.
-    static bool survives(Color& weight, Random& random) {
-        constexpr float small = 0.25f;
+    /// Russian roulette on weights that absorption has made small beside a path's first; a path
+    /// without absorption is never ended.
+    static bool survives(Color& weight, float first, Random& random) {
+        const float small = 0.25f * first;
         const float most = max_component(weight);
         if (most >= small) return true;
         if (random.uniform() * small >= most) return false;
