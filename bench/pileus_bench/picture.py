@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from pileus_bench.results import Chart, Point
 
@@ -58,6 +59,10 @@ def _panel(
     panel.set_xlabel("core seconds", fontsize=8)
     panel.set_ylabel("relMSE", fontsize=8)
     panel.tick_params(which="both", labelsize=7)
+    # Few decades of time: 1, 2 and 5 in each, as plain numbers.
+    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    panel.xaxis.set_minor_formatter(NullFormatter())
     panel.grid(alpha=0.2, which="both")
     ours = front([point for point in points if not point.peer])
     panel.plot(
