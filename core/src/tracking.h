@@ -69,7 +69,7 @@ struct ForcedCollision {
 /// there are, the less noise.
 inline ForcedCollision forced_track(const Medium& medium, const LocalRay& ray, float rate,
                                     float first_flight, Random& random) {
-    constexpr float little = 0.1f;
+    constexpr float little = 0.1f, seldom = 0.01f;
     ForcedCollision result{0.0f, 0.0f};
     track(medium, ray, rate, first_flight, random,
           [&](float t, const MajorantSegment& segment, float majorant) {
@@ -83,8 +83,8 @@ inline ForcedCollision forced_track(const Medium& medium, const LocalRay& ray, f
               if (random.uniform() * result.chance < collided) result.distance = t;
               return result.chance == 1.0f;
           });
-    if (result.chance < little)
-        result.chance = random.uniform() * little < result.chance ? little : 0.0f;
+    if (result.chance < seldom)
+        result.chance = random.uniform() * seldom < result.chance ? seldom : 0.0f;
     return result;
 }
 
