@@ -88,6 +88,32 @@ TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
     }
 }
 
+TEST_F(TrackingTest, ForcedCollisionsFollowTransmittanceTimesExtinctionByWeight) {
+    constexpr int samples = 200000;
+    constexpr std::array<double, 4> ends{0.6, 1.2, 2.4, everything};
+    const Medium thin(*volume_, 0.01f, Color(1.0f), 0.0f);  // where chances are made seldom ones
+    for (const Medium* const medium : std::array<const Medium*, 2>{&*medium_, &thin}) {
+        const double share = medium->majorant(1.0f) / medium_->majorant(1.0f);
+        for (std::size_t r = 0; r < rays_.size(); ++r) {
+            std::array<std::vector<double>, ends.size()> before;
+            Random random(300 + r);
+            for (int i = 0; i < samples; ++i) {
+                const float rate = i % 2 == 0 ? 1.0f : 4.0f;
+                const auto [chance, distance] =
+                    forced_track(*medium, rays_[r], rate, random.exponential(), random);
+                for (std::size_t e = 0; e < ends.size(); ++e)
+                    before[e].push_back(distance < ends[e] ? chance : 0.0);
+            }
+            for (std::size_t e = 0; e < ends.size(); ++e) {
+                const double wanted = -std::expm1(-share * depth(rays_[r], ends[e]));
+                const auto [mean, error] = test::estimate(before[e]);
+                EXPECT_NEAR(mean, wanted, test::z_limit(0.9999, 8 * tests()) * error + 1e-6)
+                    << "ray " << r << ", before " << ends[e] << ", tau share " << share;
+            }
+        }
+    }
+}
+
 TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
     constexpr int samples = 200000;
     constexpr std::array<float, 5> powers{1.0f, 0.5f, 0.1f, 1e-6f, 0.0f};
