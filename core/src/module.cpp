@@ -330,8 +330,7 @@ NB_MODULE(_core, m) {
             },
             "width"_a, "height"_a, "plan"_a,
             "The plan: each bucket with the samples it must reach; None: as many as its one "
-            "partial "
-            "has. Raises InputError.")
+            "partial has. Raises InputError.")
         .def("add", &Frame::add, "partial"_a, nb::call_guard<nb::gil_scoped_release>(),
              "Takes a bucket's next samples. Raises InputError for any that overlap, leave a gap "
              "or do not belong.")
@@ -405,8 +404,7 @@ NB_MODULE(_core, m) {
         "opacity"_a, "seed"_a, "frame"_a, "orders"_a = false, "threads"_a = 0,
         "control"_a.none() = nb::none(),
         "Renders a bucket until it does its share for a frame of the mean opacity `opacity` that "
-        "may "
-        "have the RMS relative error `tolerance`, with at most `samples` a pixel. Raises "
+        "may have the RMS relative error `tolerance`, with at most `samples` a pixel. Raises "
         "InputError, Cancelled.");
 
     m.def(

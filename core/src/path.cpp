@@ -191,8 +191,8 @@ void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const P
     }
 }
 
-/// The bridges' directions into a light. Neighbouring events share them, for they cost as much to
-/// draw as all else about a bridge that is not taken.
+/// The bridges' directions into a light. Neighbouring events share them: most bridges are not
+/// taken, and of such a one there is little to do but to draw its directions.
 const std::optional<Chain>& DirectLight::chain(std::size_t light, int n, const PathRandom& random) {
     constexpr int sharing = 4;
     if (n % sharing == 0) {

@@ -70,9 +70,8 @@ class Tracked final : public Method {
         return true;
     }
 
-    /// How many tentative collisions a mean free path of a camera ray has: twice as many as delta
-    /// tracking, and more where the whole volume has few, up to the point where they cost as much
-    /// as all that follows.
+    /// Tentative collisions along a camera ray, over those of delta tracking: as many where the
+    /// volume is thick, and more where a ray through all of it would have fewer than four.
     static float first_rate(const Scene& scene) {
         const auto bounds = scene.volume->world_bounds();
         if (!bounds) return 1.0f;
