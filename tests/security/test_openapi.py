@@ -21,7 +21,7 @@ from pileus_service.jobs import Done
 from pileus_service.shot import Shot
 
 CONFIG: dict[str, Any] = {
-    "generation": {"max-examples": 6, "deterministic": True, "no-shrink": True},
+    "generation": {"max-examples": 10, "deterministic": True, "no-shrink": True},
     # A shot can be right for the document and yet be refused: its caches are not there, two of its
     # values contradict each other.
     "phases": {"stateful": {"enabled": False}},
