@@ -256,6 +256,7 @@ def machine(buildah: Buildah, tmp_path: Path) -> Iterator[tuple[Path, int]]:
     [start] = [line for line in units()[1].read_text().splitlines() if line.startswith("ExecStart")]
     here = start.replace("0.0.0.0:8765", f"127.0.0.1:{port}")
     override.write_text(f"[Service]\nExecStart=\n{here}\n")
+    (root / "etc/hosts").write_text("127.0.0.1 localhost\n")  # an image has none of its own
     run("chroot", root, "systemd-sysusers")
     (root / "srv/pileus/shows").mkdir(parents=True)
     (root / "srv/pileus/farm").mkdir()
