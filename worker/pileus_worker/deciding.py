@@ -230,14 +230,18 @@ def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
 
 def _tail(a: tuple[Channels, Channels], b: tuple[Channels, Channels]) -> NDArray[np.float64]:
     """What is left out, from two halves, each whole and by order, in blocks of pixels; and two
-    standard errors more."""
+    standard errors more. Few paths may all end early; but light falls from order to order ever more
+    slowly, so none is taken to leave less than the first two let expect."""
     images = np.array([whole[c] for whole, _ in (a, b) for c in "RGB"])
     level = _blocks(images).mean(axis=0)
     products = np.mean(_rests(*a) * _rests(*b), axis=1) / (level**2 + 0.01)
     blocks = (1, 2)
     upper = products.mean(blocks) + 2 * products.std(blocks) / math.sqrt(level.size)
-    falling = np.maximum.accumulate(upper[::-1])[::-1]
-    return np.asarray(np.sqrt(np.maximum(falling, 0.0)))
+    falling = np.maximum(np.maximum.accumulate(upper[::-1])[::-1], 0.0)
+    if falling[2] > 0:
+        further = np.arange(len(falling) - 2)
+        falling[2:] = np.maximum(falling[2:], falling[2] * (falling[2] / falling[1]) ** further)
+    return np.asarray(np.sqrt(falling))
 
 
 def _rests(whole: Channels, layered: Channels) -> NDArray[np.float64]:
