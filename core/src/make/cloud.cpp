@@ -1,10 +1,10 @@
-// A cumulus is a heap of puffs: a few dozen large spheres stacked into towers on a flat base, each
-// budding smaller ones. The heap's distance field is displaced by octaves of rounded Worley
-// billows, each octave growing on the crowns of the one before, which gives cauliflower with sharp
-// creases; the side the wind comes from is eroded into wisps.
+// The distance field of a heap of puffs is displaced by octaves of rounded Worley billows, each
+// octave growing on the crowns of the one before, which gives cauliflower with sharp creases; the
+// side the wind comes from is eroded into wisps.
 #include "cloud.h"
 
-#include "blocks.h"
+#include "cache.h"
+#include "heap.h"
 #include "noise.h"
 
 #include <openvdb/openvdb.h>
@@ -21,15 +21,17 @@
 namespace pileus {
 namespace {
 
+using make::kBase;
+using make::kBlockSide;
 using make::kLeafSide;
 using make::kLeafVoxels;
+using make::Puff;
 using noise::Points;
+using noise::smoothstep;
 using noise::Values;
 using openvdb::Coord;
 using Vec3f = openvdb::Vec3s;
 
-constexpr float kFramesPerSecond = 24.0F;
-constexpr float kBase = -0.20F;           // height of the flat underside
 constexpr float kWind = 0.07F;            // drift along x, world units per second
 constexpr float kUpdraft = 0.075F;        // billows climb through the heap
 constexpr float kLargestBillow = 0.115F;  // cell of the first octave
@@ -39,16 +41,6 @@ constexpr float kBlend = 0.018F;  // puffs melt together over this length
 constexpr float kVeil = 0.04F;    // wisps trail this far out
 constexpr float kReach = 0.09F;   // billows and wisps together go no further out
 constexpr float kBite = 0.08F;    // and erosion no further in
-
-struct Puff {
-    Vec3f centre;
-    float radius;
-};
-
-float smoothstep(float low, float high, float x) {
-    const float t = std::clamp((x - low) / (high - low), 0.0F, 1.0F);
-    return t * t * (3.0F - 2.0F * t);
-}
 
 // Joins two distances with a fillet of width `k`.
 float fillet(float a, float b, float k) {
@@ -69,84 +61,6 @@ void turn(Points& p) {
     }
 }
 
-// The towers of a seed as puffs, before any motion, fitted to the frame: a world unit wide, a
-// little more than half as high.
-std::vector<Puff> towers(noise::Random& random) {
-    std::vector<Puff> puffs;
-    const float peak = random(-0.12F, 0.10F);
-    constexpr int kTowers = 19;
-    for (int t = 0; t < kTowers; ++t) {
-        // Sunflower order: even over the footprint, nowhere in rows.
-        const float angle = 2.39996F * static_cast<float>(t) + random(-0.4F, 0.4F);
-        const float ring = std::sqrt((static_cast<float>(t) + 0.2F) / kTowers);
-        Vec3f foot(0.43F * ring * std::cos(angle), kBase, 0.31F * ring * std::sin(angle));
-        foot.x() += peak * (1.0F - ring);
-        // The highest stands off centre, the others fall away around it.
-        const float fall = std::hypot((foot.x() - peak) / 0.50F, foot.z() / 0.42F);
-        const float height = 0.54F * std::max(0.06F, 1.0F - fall) * random(0.6F, 1.15F);
-        float radius = random(0.065F, 0.09F) + 0.16F * height;
-        Vec3f at = foot + Vec3f(0.0F, 0.45F * radius, 0.0F);
-        const float top = kBase + height;
-        for (int level = 0; level < 8; ++level) {
-            puffs.push_back({at, radius});
-            if (at.y() + radius > top) break;
-            const float step = radius * random(0.7F, 0.95F);
-            radius *= random(0.80F, 1.0F);
-            const float back = random(-0.6F, 0.6F) * step;
-            at += Vec3f(random(-0.6F, 0.75F) * step, step, back);
-        }
-    }
-
-    float left = 1.0F;
-    float right = -1.0F;
-    float top = kBase;
-    for (const Puff& puff : puffs) {
-        left = std::min(left, puff.centre.x() - puff.radius);
-        right = std::max(right, puff.centre.x() + puff.radius);
-        top = std::max(top, puff.centre.y() + puff.radius);
-    }
-    const float across = 0.98F / (right - left);
-    const float up = 0.455F / (top - kBase);
-    for (Puff& puff : puffs) {
-        puff.centre.x() = (puff.centre.x() - 0.5F * (left + right)) * across;
-        puff.centre.y() = kBase + (puff.centre.y() - kBase) * up;
-        puff.radius *= 0.5F * (across + up);
-    }
-    return puffs;
-}
-
-// All puffs at a time. All motion is a smooth function of time, so any frame stands alone.
-std::vector<Puff> heap(std::uint32_t seed, float time) {
-    noise::Random random(noise::combine(seed, 1));
-    std::vector<Puff> puffs = towers(random);
-
-    // Each puff breathes at its own pace and climbs a little as it swells.
-    const auto move = [&](Puff& puff, float lift) {
-        const float pace = random(0.5F, 1.1F);
-        const float phase = random(0.0F, 6.2832F);
-        const float swell = std::sin(pace * time + phase) - std::sin(phase);
-        puff.radius *= 1.0F + 0.06F * swell;
-        puff.centre += Vec3f(0.25F, 1.0F, 0.0F) * (lift * 0.045F * swell);
-    };
-    const std::size_t parents = puffs.size();
-    for (Puff& puff : puffs) move(puff, (puff.centre.y() - kBase) / 0.5F);
-
-    // Buds: smaller puffs on the upper and outer sides of the large ones.
-    for (std::size_t i = 0; i < parents; ++i) {
-        for (int k = 0; k < 12; ++k) {
-            const Puff parent = puffs[i];
-            Vec3f out = random.direction();
-            out.y() = std::abs(out.y()) * 1.1F - 0.15F;
-            out.normalize();
-            const float radius = parent.radius * random(0.26F, 0.55F);
-            Puff bud{parent.centre + out * (parent.radius * random(0.78F, 0.98F)), radius};
-            move(bud, 0.5F);
-            puffs.push_back(bud);
-        }
-    }
-    return puffs;
-}
-
 class Cumulus {
   public:
     explicit Cumulus(const MakeOptions& options)
@@ -156,7 +70,7 @@ class Cumulus {
           time_((static_cast<float>(options.frame) -
                  0.5F * (static_cast<float>(options.frames) + 1.0F)) /
                 kFramesPerSecond),
-          puffs_(heap(seed_, time_)) {
+          puffs_(make::heap(seed_, time_)) {
         // Detail goes down to what the voxels can hold.
         float cell = kLargestBillow;
         for (int i = 0; i < kMostOctaves && cell > 2.6F * voxel_; ++i) {
@@ -213,21 +127,14 @@ class Cumulus {
         values.density.fill(0.0F);
         const std::vector<Puff> near = around(origin, kLeafSide, puffs_);
         bool any = false;
-        // Blocks of 4^3 voxels: small enough that few puffs and billows compete in each.
-        for (int block = 0; block < 8; ++block) {
-            const Coord corner =
-                origin.offsetBy((block >> 2) * kBlockSide, ((block >> 1) & 1) * kBlockSide,
-                                (block & 1) * kBlockSide);
-            any |= fill_block(origin, corner, near, values);
-        }
+        // Blocks are small enough that few puffs and billows compete in each.
+        make::for_each_block(
+            origin, [&](const Coord& corner) { any |= fill_block(origin, corner, near, values); });
         if (any) fill_velocity(origin, values);
         return any;
     }
 
   private:
-    static constexpr int kBlockSide = 4;
-    static_assert(kBlockSide * kBlockSide * kBlockSide == noise::kBatch);
-
     // Half the width of a crisp edge.
     float crisp() const { return 1.1F * voxel_; }
 
@@ -236,8 +143,7 @@ class Cumulus {
 
     // Position in the frame that drifts with the cloud.
     Vec3f place(const Coord& ijk) const {
-        return Vec3f(static_cast<float>(ijk.x()) * voxel_ - kWind * time_,
-                     static_cast<float>(ijk.y()) * voxel_, static_cast<float>(ijk.z()) * voxel_);
+        return make::place(ijk, voxel_) - Vec3f(kWind * time_, 0.0F, 0.0F);
     }
 
     // The puffs of a list that decide the distance anywhere in a box of voxels; none where the box
@@ -268,7 +174,7 @@ class Cumulus {
         Points at;
         Values distance;
         for (std::size_t i = 0; i < noise::kBatch; ++i) {
-            const Vec3f p = place(voxel_in(corner, i));
+            const Vec3f p = place(make::voxel_of_block(corner, i));
             at.x[i] = p.x();
             at.y[i] = p.y();
             at.z[i] = p.z();
@@ -290,16 +196,10 @@ class Cumulus {
             const float density = density_at(Vec3f(at.x[i], at.y[i], at.z[i]), distance[i]);
             if (density < make::kFaint) continue;
             any = true;
-            const Coord ijk = voxel_in(corner, i) - origin;
-            values.density[static_cast<std::size_t>((ijk.x() << 6) | (ijk.y() << 3) | ijk.z())] =
-                density;
+            const Coord ijk = make::voxel_of_block(corner, i) - origin;
+            values.density[make::number_in_leaf(ijk.x(), ijk.y(), ijk.z())] = density;
         }
         return any;
-    }
-
-    static Coord voxel_in(const Coord& corner, std::size_t n) {
-        const auto i = static_cast<int>(n);
-        return corner.offsetBy(i >> 4, (i >> 2) & 3, i & 3);
     }
 
     // Grows billows on the heap, octave by octave, for as long as they can still move the edge.
@@ -409,14 +309,7 @@ class Cumulus {
 }  // namespace
 
 std::int64_t make_cloud(const std::string& path, const MakeOptions& options) {
-    validate(options);
-    openvdb::initialize();
-    const Cumulus cumulus(options);
-    make::Cache cache(cumulus.voxel());
-    cache.fill_leaves(cumulus.leaves(), [&](const Coord& origin, make::LeafValues& values) {
-        return cumulus.fill(origin, values);
-    });
-    return cache.write(path, options, "pileus make cloud");
+    return make::make_cache<Cumulus>(path, options, "pileus make cloud");
 }
 
 }  // namespace pileus

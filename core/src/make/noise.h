@@ -4,6 +4,7 @@
 
 #include <openvdb/Types.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstddef>
@@ -41,6 +42,12 @@ inline std::uint32_t cell_hash(std::uint32_t seed, int x, int y, int z) {
 
 // A hash as a number in [0, 1).
 inline float unit(std::uint32_t h) { return static_cast<float>(h >> 8) * 0x1p-24F; }
+
+// From 0 at `low` to 1 at `high`, flat at both ends.
+inline float smoothstep(float low, float high, float x) {
+    const float t = std::clamp((x - low) / (high - low), 0.0F, 1.0F);
+    return t * t * (3.0F - 2.0F * t);
+}
 
 // A smooth swing between -1 and 1, once per whole number: a sine in shape, parabolas in cost.
 inline float wave(float turns) {

@@ -6,6 +6,9 @@
 
 namespace pileus {
 
+// Of a cache: velocities are per second of it.
+constexpr float kFramesPerSecond = 24.0F;
+
 struct MakeOptions {
     int frame = 1;           // counted from 1
     int frames = 24;         // length of the sequence: the action is laid out over it

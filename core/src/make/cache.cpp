@@ -1,5 +1,5 @@
 // Packs leaves into OpenVDB trees.
-#include "blocks.h"
+#include "cache.h"
 
 #include "../vdb_file.h"
 
@@ -58,7 +58,7 @@ std::int64_t Cache::write(const std::string& path, const MakeOptions& options,
     metadata.insertMeta("creator", openvdb::StringMetadata(creator));
     metadata.insertMeta("frame", openvdb::Int32Metadata(options.frame));
     metadata.insertMeta("frames", openvdb::Int32Metadata(options.frames));
-    metadata.insertMeta("framesPerSecond", openvdb::FloatMetadata(24.0F));
+    metadata.insertMeta("framesPerSecond", openvdb::FloatMetadata(kFramesPerSecond));
     metadata.insertMeta("resolution", openvdb::Int32Metadata(options.resolution));
     metadata.insertMeta("seed", openvdb::Int64Metadata(static_cast<std::int64_t>(options.seed)));
 

@@ -2,33 +2,18 @@
 // from its place alone, so the result depends neither on threads nor on order.
 #pragma once
 
+#include "leaf.h"
 #include "options.h"
 
 #include <openvdb/openvdb.h>
 #include <tbb/parallel_for.h>
 
-#include <array>
 #include <cstddef>
 #include <memory>
 #include <string>
 #include <vector>
 
 namespace pileus::make {
-
-constexpr int kLeafSide = 8;
-constexpr int kLeafVoxels = kLeafSide * kLeafSide * kLeafSide;
-
-// The values of one leaf, in the order of OpenVDB's: z fastest. A voxel is active where its
-// density is above zero.
-struct LeafValues {
-    std::array<float, kLeafVoxels> density;
-    std::array<openvdb::Vec3s, kLeafVoxels> velocity;
-};
-
-// Index coordinates of the n-th voxel of the leaf at `origin`.
-inline openvdb::Coord voxel_of(const openvdb::Coord& origin, int n) {
-    return origin.offsetBy(n >> 6, (n >> 3) & 7, n & 7);
-}
 
 // Density below this is dropped: it is under what half floats and the eye can tell.
 constexpr float kFaint = 1e-3F;
@@ -67,5 +52,20 @@ class Cache {
     openvdb::FloatGrid::Ptr density_;
     openvdb::Vec3SGrid::Ptr velocity_;
 };
+
+// Makes one frame of a `Shape`, which tells its voxel size, the leaves that it may reach and what
+// fills each. Returns the number of active voxels.
+template <typename Shape>
+std::int64_t make_cache(const std::string& path, const MakeOptions& options,
+                        const std::string& creator) {
+    validate(options);
+    openvdb::initialize();
+    const Shape shape(options);
+    Cache cache(shape.voxel());
+    cache.fill_leaves(shape.leaves(), [&](const openvdb::Coord& origin, LeafValues& values) {
+        return shape.fill(origin, values);
+    });
+    return cache.write(path, options, creator);
+}
 
 }  // namespace pileus::make
