@@ -160,7 +160,7 @@ def test_a_redis_that_was_emptied_is_filled_again_from_disk(
     client.post(f"/v1/jobs/{cancelled}/cancel")
     wait_for(lambda: farm.store.wished(done).state == "done")
     redis.flushall()
-    wait_for(lambda: len(farm.queue.job_ids()) == 3)
+    wait_for(lambda: len(farm.queue.job_ids(10)) == 3)
     states = {each["id"]: each["state"] for each in client.get("/v1/jobs").json()}
     assert states == {done: "done", paused: "paused", cancelled: "cancelled"}
     assert client.get(f"/v1/jobs/{paused}").json()["priority"] == 8

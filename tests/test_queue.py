@@ -406,7 +406,34 @@ def test_a_retry_takes_the_failed_frames_only(queue: Queue) -> None:
         do(queue, task)
     assert frames == {1}
     assert view(queue) == ("done", 3, 0)
-    assert queue.standings()["job"] == ("done", 5, 1)
+    assert queue.standings(["job"]) == [("done", 5, 1)]
+
+
+def test_what_changed_is_told_and_a_loss_is_noticed(queue: Queue, redis: Redis) -> None:
+    mark, jobs = queue.changed(None)
+    assert jobs is None, "at first nothing is known"
+    for name in ("one", "two", "three"):
+        submit(queue, name)
+    mark, jobs = queue.changed(mark)
+    assert jobs == ["one", "two", "three"]
+    queue.control("two", "pause")
+    queue.control("two", "resume")
+    mark, jobs = queue.changed(mark)
+    assert jobs == ["two"]
+    mark, jobs = queue.changed(mark)
+    assert jobs == []
+    queue.control("two", "remove")
+    assert redis.zrange("pileus:changed", 0, -1) == ["one", "three"], "as long as the jobs"
+    mark, jobs = queue.changed(mark)
+    assert jobs is None, "one has gone"
+    redis.incr("pileus:changes")  # as a worker of a version that keeps no list
+    mark, jobs = queue.changed(mark)
+    assert jobs is None
+    redis.flushall()
+    submit(queue, "four")
+    mark, jobs = queue.changed(mark)
+    assert jobs is None, "the count went back"
+    assert queue.changed(mark._replace(process="another"))[1] is None
 
 
 def test_a_retry_while_the_job_runs_begins_no_frame_twice(queue: Queue) -> None:

@@ -79,7 +79,7 @@ def test_a_full_redis_refuses_and_forgets_nothing(redis: Redis, redis_url: str) 
     try:
         with pytest.raises(RedisError):
             queue.submit("another", "another", time.time(), 1, Wish())
-        assert queue.job_ids() == ["job"]
+        assert queue.job_ids(10) == ["job"]
     finally:
         redis.config_set("maxmemory", "1gb")
     task = queue.claim(WORKER)

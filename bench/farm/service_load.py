@@ -128,7 +128,7 @@ def main() -> None:
         with Farm(folder, [folder], 2, task_seconds=1) as farm:
             fill(farm, shot, asked.jobs)
             begun = time.monotonic()
-            until(lambda: len(farm.queue.job_ids()) >= asked.jobs, 300)
+            until(lambda: len(farm.queue.job_ids(asked.jobs)) >= asked.jobs, 300)
             told["taken_up_seconds"] = round(time.monotonic() - begun, 1)
             job = farm.client.submit(make_shot(folder, "now", 64), priority=5).job.id
             until(lambda: any(worker.task for worker in farm.queue.workers()))

@@ -51,7 +51,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
     async def keep_true() -> None:
         while True:
             try:
-                await run_in_threadpool(farm.reconcile)
+                await run_in_threadpool(farm.agreement.reconcile)
             except (RedisError, OSError) as error:
                 log.warning("cannot reconcile yet", reason=str(error))
             await asyncio.sleep(1)

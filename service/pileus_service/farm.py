@@ -1,11 +1,11 @@
 """The farm as the service sees it: the store, which is the truth, and the queue kept true to it."""
 
-import threading
 import time
 from typing import Literal
 
 import structlog
 
+from pileus_service.agreement import Agreement
 from pileus_service.errors import InputError
 from pileus_service.jobs import (
     TERMINAL,
@@ -32,16 +32,13 @@ from pileus_service.webhooks import Webhooks, hooks_from_environment
 
 log = structlog.stdlib.get_logger(__name__)
 
-CHECK_ALL = 30.0
-_WISHED: dict[str, Verb] = {"paused": "pause", "running": "resume", "cancelled": "cancel"}
-
 
 class ConflictError(InputError):
     """The same idempotency key was used for something else."""
 
 
 class Farm:
-    """Submits, steers and shows jobs. Disk first, Redis second: `reconcile` mends the rest."""
+    """Submits, steers and shows jobs. Disk first, Redis second: `Agreement` mends the rest."""
 
     def __init__(
         self, store: Store, queue: Queue, roots: Roots, hooks: Webhooks | None = None
@@ -50,9 +47,7 @@ class Farm:
         self.queue = queue
         self.roots = roots
         self.hooks = hooks or hooks_from_environment(store.root)
-        self._lock = threading.RLock()
-        self._wishes: dict[str, Wish] = {}
-        self._agreed: tuple[int, float] | None = None
+        self.agreement = Agreement(store, queue, self.hooks)
 
     def submit(
         self,
@@ -90,7 +85,7 @@ class Farm:
 
     def control(self, job_id: str, verb: Verb, priority: int = 0) -> JobView | None:
         """Pauses, resumes, cancels a job, changes its priority or retries its failed frames."""
-        with self._lock:
+        with self.agreement.lock:
             view = self.job(job_id)
             if view is None:
                 return None
@@ -104,7 +99,7 @@ class Farm:
             else:
                 state = {"pause": "paused", "resume": "running", "cancel": "cancelled"}[verb]
                 wish = wish.model_copy(update={"state": state})
-            self._keep(job_id, wish)
+            self.agreement.keep(job_id, wish)
             self.queue.control(job_id, verb, priority)
             log.info(verb, job=job_id, **({"priority": priority} if verb == "priority" else {}))
             return self.job(job_id)
@@ -115,16 +110,16 @@ class Farm:
             return view
         life = wish.life + 1
         state = "paused" if view.state is JobState.PAUSED else "running"
-        self._keep(view.id, Wish(state=state, priority=view.priority, life=life))
+        self.agreement.keep(view.id, Wish(state=state, priority=view.priority, life=life))
         self.queue.control(view.id, "retry", life)
         log.info("retry", job=view.id, frames=view.frames_failed)
         return self.job(view.id)
 
     def remove(self, job_id: str) -> bool:
-        with self._lock:
+        with self.agreement.lock:
             if self.store.job(job_id) is None:
                 return False
-            self._wishes.pop(job_id, None)
+            self.agreement.forget(job_id)
             # The disk first, or a reconciliation would bring it back.
             self.store.remove(job_id)
             self.queue.control(job_id, "cancel")
@@ -136,14 +131,14 @@ class Farm:
         """A job; one that Redis has lost is put back first."""
         view = self.queue.job(job_id)
         if view is None:
-            if not self._restore(job_id):
+            if not self.agreement.restore(job_id):
                 return None
             view = self.queue.job(job_id)
         return self._numbered(view) if view else None
 
     def jobs(self, limit: int, offset: int) -> list[JobView]:
         """Newest first."""
-        views = self.views(self.queue.job_ids()[::-1][offset : offset + limit])
+        views = self.views(self.queue.job_ids(limit, offset))
         return [view for view in views if view]
 
     def views(self, job_ids: list[str]) -> list[JobView | None]:
@@ -231,91 +226,6 @@ class Farm:
 
     def done(self, job_id: str, frame: int) -> Done | None:
         return self.store.frame(job_id, frame).done() if self.store.job(job_id) else None
-
-    def reconcile(self) -> None:
-        """Makes Redis agree with the disk, and notes on disk how jobs ended. Called each second;
-        looks at all jobs only when one has changed, Redis has lost something, or time has passed.
-        """
-        changes, now = self.queue.changes(), time.monotonic()
-        if self._agreed is not None:
-            last, at = self._agreed
-            if changes == last and now - at < CHECK_ALL:
-                return
-        # Redis first: what is on no disk by now was removed, and not just submitted.
-        standings = self.queue.standings()
-        on_disk = set(self.store.job_ids(known=self._wishes))
-        for job_id in standings.keys() - on_disk:
-            self.queue.control(job_id, "remove")
-        # Of many that Redis has lost, those with work to do come back first.
-        for job_id in sorted(on_disk, key=lambda each: (self._wish(each).state in TERMINAL, each)):
-            self._agree(job_id, standings.get(job_id))
-        self.queue.forget_dead()
-        self._agreed = changes, now
-
-    def _wish(self, job_id: str) -> Wish:
-        wish = self._wishes.get(job_id)
-        if wish is None:
-            wish = self._wishes[job_id] = self.store.wished(job_id)
-        return wish
-
-    def _agree(self, job_id: str, standing: tuple[str, int, int] | None) -> None:
-        wish = self._wish(job_id)
-        if standing == (wish.state, wish.priority, wish.life):
-            return
-        with self._lock:
-            # Another may have written since; what is on disk now holds.
-            self._wishes[job_id] = wish = self.store.wished(job_id)
-            standing = self.queue.standing(job_id)
-            if standing is None:
-                self._restore(job_id)
-                return
-            state, priority, life = standing
-            if life != wish.life or (wish.state in TERMINAL and state != wish.state):
-                # A Redis of an earlier day: this job is built anew, what it has finished stays.
-                self.queue.control(job_id, "remove")
-                self._restore(job_id)
-            elif state in TERMINAL:
-                if wish.state != state:
-                    self._note_end(job_id, state)
-            else:
-                if wish.state != state:
-                    self.queue.control(job_id, _WISHED[wish.state])
-                if wish.priority != priority:
-                    self.queue.control(job_id, "priority", wish.priority)
-
-    def _restore(self, job_id: str) -> bool:
-        """Puts a job of the disk into Redis; what it has finished stays finished."""
-        job = self.store.job(job_id)
-        if job is None:
-            return False
-        done = self.store.done_frames(job)
-        wish = self.store.wished(job_id)
-        frames = len(job.shot.frame_numbers)
-        self.queue.submit(job_id, job.shot.name, job.created, frames, wish, done)
-        return True
-
-    def _note_end(self, job_id: str, state: str) -> None:
-        view = self.queue.job(job_id)
-        if view is not None:
-            wish = Wish.model_validate(
-                {
-                    "state": state,
-                    "priority": view.priority,
-                    "life": self._wishes[job_id].life,
-                    "finished": view.finished,
-                    "failed": self.queue.failed(job_id),
-                }
-            )
-            self._keep(job_id, wish)
-            log.info("ended", job=job_id, state=state, failed=len(wish.failed))
-
-    def _keep(self, job_id: str, wish: Wish) -> None:
-        job = self.store.job(job_id) if wish.state in TERMINAL else None
-        if job is not None:
-            # First the notice: an end that is on disk is not looked at again.
-            self.hooks.note_end(job, wish)
-        self.store.wish(job_id, wish)
-        self._wishes[job_id] = wish
 
     def _numbered(self, view: JobView) -> JobView:
         """Puts frame numbers in the place of indices."""

@@ -9,7 +9,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from importlib.resources import files
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 from redis import Redis
 from redis.backoff import ExponentialBackoff
@@ -20,7 +20,6 @@ from redis.retry import Retry
 from pileus_service.errors import InputError, printable
 from pileus_service.jobs import (
     FORMAT,
-    FrameView,
     JobState,
     JobView,
     Result,
@@ -29,6 +28,7 @@ from pileus_service.jobs import (
     WorkerInfo,
     WorkerView,
 )
+from pileus_service.views import frame_view, job_view
 
 LEASE = 10.0
 RENEWAL = 2.5
@@ -39,11 +39,21 @@ SCRIPTS = ("submit", "claim", "renew", "complete", "release", "control")
 UNREACHABLE = (RedisConnectionError, RedisTimeoutError)
 
 Verb = Literal["pause", "resume", "cancel", "remove", "priority", "retry"]
-FRAME_STATES: dict[str, Literal["planning", "rendering", "merging"]] = {
-    "plan": "planning",
-    "render": "rendering",
-    "merge": "merging",
-}
+
+
+class Standing(NamedTuple):
+    """What the service compares with its disk."""
+
+    state: str
+    priority: int
+    life: int
+
+
+class Mark(NamedTuple):
+    """A point in the history of one Redis process: the count of changes to any job's standing."""
+
+    process: str
+    changes: int
 
 
 def connect(url: str) -> "Redis":
@@ -105,8 +115,10 @@ class Queue:
         """
         return cast(str | None, self._run("control", job, verb, number))
 
-    def job_ids(self) -> list[str]:
-        return cast(list[str], self.redis.zrange("pileus:jobs", 0, -1))
+    def job_ids(self, limit: int, offset: int = 0) -> list[str]:
+        """Newest first."""
+        oldest, newest = -(offset + limit), -(offset + 1)
+        return cast(list[str], self.redis.zrange("pileus:jobs", oldest, newest))[::-1]
 
     def job(self, job: str) -> JobView | None:
         """A job with its progress, in-flight samples of the workers included."""
@@ -134,27 +146,37 @@ class Queue:
             for entry in flight.values():
                 frame, samples = entry.split()
                 in_flight[int(frame)] += int(samples)
-            shown = [_frame_view(int(index), next(frames), in_flight) for index in active]
+            shown = [frame_view(int(index), next(frames), in_flight) for index in active]
             in_order = [frame for frame in shown if frame]
             now = seconds + micros / 1e6
-            views.append(_job_view(job, held, failed, in_order, now) if held else None)
+            views.append(job_view(job, held, failed, in_order, now) if held else None)
         return views
 
-    def standings(self) -> dict[str, tuple[str, int, int]]:
-        """Each job's state, priority and life."""
-        held = cast(dict[str, str], self.redis.hgetall("pileus:standing"))
-        return {job: _standing(told) for job, told in held.items()}
+    def standings(self, jobs: Sequence[str]) -> list[Standing | None]:
+        """Of each job, in one round trip; None where Redis knows none."""
+        told = cast(list[str | None], self.redis.hmget("pileus:standing", list(jobs)))
+        return [_standing(each) if each else None for each in told]
 
-    def standing(self, job: str) -> tuple[str, int, int] | None:
-        told = cast(str | None, self.redis.hget("pileus:standing", job))
-        return _standing(told) if told else None
+    def changed(self, since: Mark | None) -> tuple[Mark, list[str] | None]:
+        """The jobs whose standing has changed since a mark, and the mark for the next time. None
+        in their place where that cannot be known: Redis has been started anew or has lost data,
+        a job was removed, or a program that keeps no list of changes has made one."""
+        ask = self.redis.pipeline(transaction=False)
+        ask.info("server")
+        ask.get("pileus:changes")
+        ask.zrange("pileus:changed", -1, -1, withscores=True)
+        ask.zrangebyscore("pileus:changed", f"({since.changes if since else 0}", "+inf")
+        server, count, newest, jobs = ask.execute()
+        mark = Mark(server["run_id"], int(count or 0))
+        if since is None or mark.process != since.process or mark.changes < since.changes:
+            return mark, None
+        listed = newest[0][1] if newest else 0
+        if mark.changes > since.changes and listed < mark.changes:
+            return mark, None
+        return mark, jobs
 
     def state(self, job: str) -> str | None:
         return cast(str | None, self.redis.hget(f"pileus:job:{job}", "state"))
-
-    def changes(self) -> int:
-        """A count that differs after any job's standing has changed, or Redis has lost its data."""
-        return int(cast(str | None, self.redis.get("pileus:changes")) or -1)
 
     def failed(self, job: str) -> dict[int, str]:
         """Reason by frame index."""
@@ -250,10 +272,8 @@ class Queue:
 
     def jobs_by_state(self) -> dict[JobState, int]:
         """How many jobs there are in each state; those not begun count as running."""
-        pipe = self.redis.pipeline(transaction=False)
-        for job in self.job_ids():
-            pipe.hget(f"pileus:job:{job}", "state")
-        found = Counter(pipe.execute())
+        held = cast(dict[str, str], self.redis.hgetall("pileus:standing"))
+        found = Counter(told.partition(" ")[0] for told in held.values())
         return {state: found[state] for state in JobState if state is not JobState.QUEUED}
 
     def forget_dead(self) -> None:
@@ -320,55 +340,6 @@ class Queue:
                     self.redis.xgroup_delconsumer(stream, GROUP, worker)
 
 
-def _standing(told: str) -> tuple[str, int, int]:
+def _standing(told: str) -> Standing:
     state, priority, life = told.split()
-    return state, int(priority), int(life)
-
-
-def _frame_view(index: int, held: dict[str, str], in_flight: Counter[int]) -> FrameView | None:
-    if not held:
-        return None
-    total = int(held["total"])
-    samples = int(held["samples"]) + in_flight[index]
-    return FrameView(
-        frame=index,
-        state=FRAME_STATES[held["state"]],
-        tasks=int(held["tasks"]),
-        tasks_done=int(held["done"]),
-        progress=min(1.0, samples / total) if total else 0.0,
-    )
-
-
-def _job_view(
-    job: str, held: dict[str, str], failed: dict[str, str], active: list[FrameView], now: float
-) -> JobView:
-    frames, done = int(held["frames"]), int(held["done"])
-    settled = done + len(failed) + sum(frame.progress for frame in active)
-    state = JobState(held["state"])
-    if state is JobState.RUNNING and "started" not in held:
-        state = JobState.QUEUED
-    left = None
-    gained = settled - int(held["restored"])
-    if state is JobState.RUNNING and gained > 0:
-        worked = now - (int(held["started"]) + int(held.get("idle", 0))) / 1000
-        left = worked * (frames - settled) / gained
-    first = min(failed, key=int) if failed else None
-    return JobView(
-        id=job,
-        name=held["name"],
-        state=state,
-        priority=int(held["priority"]),
-        frames=frames,
-        frames_done=done,
-        frames_failed=len(failed),
-        progress=settled / frames,
-        samples=int(held["samples"]),
-        tasks=int(held["tasks"]),
-        created=int(held["created"]) / 1000,
-        started=int(held["started"]) / 1000 if "started" in held else None,
-        finished=int(held["finished"]) / 1000 if "finished" in held else None,
-        seconds_left=left,
-        # By index as all else here; `Farm` puts in the frame's number.
-        reason=f"{first}: {failed[first]}" if first is not None else None,
-        active=active,
-    )
+    return Standing(state, int(priority), int(life))

@@ -123,11 +123,12 @@ class Store:
 
     def job_ids(self, known: Container[str] = ()) -> Iterator[str]:
         """The jobs that are here; a folder of a known one is believed to hold it."""
-        for folder in self.jobs_folder.iterdir():
-            if folder.name in known or (
-                JOB_ID.fullmatch(folder.name) and (folder / "job.json").exists()
-            ):
-                yield folder.name
+        with os.scandir(self.jobs_folder) as folders:
+            for folder in folders:
+                if folder.name in known or (
+                    JOB_ID.fullmatch(folder.name) and self.has(folder.name)
+                ):
+                    yield folder.name
 
     def wish(self, job_id: str, wish: Wish) -> None:
         write_whole(self._folder(job_id) / "state.json", wish.model_dump_json().encode())

@@ -39,11 +39,12 @@ local function greet(worker, info)
   redis.call('HSET', 'pileus:versions', worker, cjson.decode(info).version)
 end
 
--- What the service compares with its disk, of all jobs in one place, and a count of the changes.
+-- What the service compares with its disk, of all jobs in one place; a count of the changes, and at
+-- which count each job changed last.
 local function note_standing(job)
   local state, priority, life = unpack(redis.call('HMGET', job_of(job), 'state', 'priority', 'life'))
   redis.call('HSET', 'pileus:standing', job, state .. ' ' .. priority .. ' ' .. life)
-  redis.call('INCR', 'pileus:changes')
+  redis.call('ZADD', 'pileus:changed', redis.call('INCR', 'pileus:changes'), job)
 end
 
 local function set_state(job, state)

@@ -37,6 +37,7 @@ elseif verb == 'remove' then
   redis.call('DEL', key, key .. ':done', key .. ':failed')
   redis.call('ZREM', 'pileus:jobs', job)
   redis.call('HDEL', 'pileus:standing', job)
+  redis.call('ZREM', 'pileus:changed', job)
   redis.call('INCR', 'pileus:changes')
   return 'removed'
 elseif verb == 'retry' and (open or state == 'failed') then

@@ -1,0 +1,161 @@
+"""Keeps Redis true to the disk: what is wanted of each job is told to Redis, and how it ended there
+is noted on disk. The disk is the truth; what Redis lacks is built anew from it."""
+
+import threading
+import time
+from collections.abc import Iterable, Iterator
+
+import structlog
+
+from pileus_service.jobs import TERMINAL, Wish
+from pileus_service.queue import Mark, Queue, Standing, Verb
+from pileus_service.store import Store
+from pileus_service.webhooks import Webhooks
+
+log = structlog.stdlib.get_logger(__name__)
+
+COMPARE_ALL = 30.0
+# Thousands of jobs are compared by and by, so that a request never waits for more than a page.
+PAGE = 200
+BREATH = 0.005
+_WISHED: dict[str, Verb] = {"paused": "pause", "running": "resume", "cancelled": "cancel"}
+
+
+class Agreement:
+    """What is wanted of the jobs, and made true. `lock` is held while a job is steered."""
+
+    def __init__(self, store: Store, queue: Queue, hooks: Webhooks) -> None:
+        self._store = store
+        self._queue = queue
+        self._hooks = hooks
+        self.lock = threading.RLock()
+        self._wishes: dict[str, Wish] = {}
+        self._seen: Mark | None = None
+        self._compared = 0.0
+
+    def reconcile(self) -> None:
+        """Called each second: looks at the jobs that have changed since; at all of them at first,
+        when Redis cannot tell, and as time passes."""
+        mark, changed = self._queue.changed(self._seen)
+        now = time.monotonic()
+        if changed is None or now - self._compared >= COMPARE_ALL:
+            self._compare_all()
+            self._queue.forget_dead()
+            self._compared = now
+        else:
+            for job_id, standing in self._standings(changed):
+                if standing is not None and not self._store.has(job_id):
+                    self._queue.control(job_id, "remove")
+                elif standing is not None:
+                    self._agree(job_id, standing)
+        self._seen = mark
+
+    def keep(self, job_id: str, wish: Wish) -> None:
+        """Writes what is wanted of a job, or how it ended, to the disk."""
+        job = self._store.job(job_id) if wish.state in TERMINAL else None
+        if job is not None:
+            # First the notice: an end that is on disk is not looked at again.
+            self._hooks.note_end(job, wish)
+        self._store.wish(job_id, wish)
+        self._wishes[job_id] = wish
+
+    def forget(self, job_id: str) -> None:
+        self._wishes.pop(job_id, None)
+
+    def restore(self, job_id: str) -> bool:
+        """Puts a job of the disk into Redis; what it has finished stays finished."""
+        job = self._store.job(job_id)
+        if job is None:
+            return False
+        done = self._store.done_frames(job)
+        wish = self._store.wished(job_id)
+        frames = len(job.shot.frame_numbers)
+        self._queue.submit(job_id, job.shot.name, job.created, frames, wish, done)
+        return True
+
+    def _compare_all(self) -> None:
+        # Redis first: what is on no disk by now was removed, and not just submitted.
+        in_redis = set(self._all_in_redis())
+        on_disk = set(_slowly(self._store.job_ids(known=self._wishes)))
+        for job_id in in_redis - on_disk:
+            self._queue.control(job_id, "remove")
+        for job_id in self._wishes.keys() - on_disk:
+            self.forget(job_id)
+        astray = [
+            (job_id, standing)
+            for job_id, standing in self._standings(list(on_disk))
+            if standing != _standing(self._wish(job_id))
+        ]
+        # Of many that Redis has lost, those with work to do come back first.
+        for job_id, standing in sorted(
+            astray, key=lambda each: (self._wish(each[0]).state in TERMINAL, each[0])
+        ):
+            self._agree(job_id, standing)
+
+    def _all_in_redis(self) -> Iterator[str]:
+        offset = 0
+        while page := self._queue.job_ids(PAGE, offset):
+            yield from page
+            offset += PAGE
+            time.sleep(BREATH)
+
+    def _standings(self, job_ids: list[str]) -> Iterator[tuple[str, Standing | None]]:
+        for at in range(0, len(job_ids), PAGE):
+            page = job_ids[at : at + PAGE]
+            yield from zip(page, self._queue.standings(page), strict=True)
+            time.sleep(BREATH)
+
+    def _wish(self, job_id: str) -> Wish:
+        wish = self._wishes.get(job_id)
+        if wish is None:
+            wish = self._wishes[job_id] = self._store.wished(job_id)
+        return wish
+
+    def _agree(self, job_id: str, standing: Standing | None) -> None:
+        if standing == _standing(self._wish(job_id)):
+            return
+        with self.lock:
+            # Another may have written since; what is on disk now holds.
+            self._wishes[job_id] = wish = self._store.wished(job_id)
+            [now] = self._queue.standings([job_id])
+            if now is None:
+                self.restore(job_id)
+            elif now.life != wish.life or (wish.state in TERMINAL and now.state != wish.state):
+                # A Redis of an earlier day: this job is built anew, what it has finished stays.
+                self._queue.control(job_id, "remove")
+                self.restore(job_id)
+            elif now.state in TERMINAL:
+                if wish.state != now.state:
+                    self._note_end(job_id, now.state)
+            else:
+                if wish.state != now.state:
+                    self._queue.control(job_id, _WISHED[wish.state])
+                if wish.priority != now.priority:
+                    self._queue.control(job_id, "priority", wish.priority)
+
+    def _note_end(self, job_id: str, state: str) -> None:
+        view = self._queue.job(job_id)
+        if view is not None:
+            wish = Wish.model_validate(
+                {
+                    "state": state,
+                    "priority": view.priority,
+                    "life": self._wishes[job_id].life,
+                    "finished": view.finished,
+                    "failed": self._queue.failed(job_id),
+                }
+            )
+            self.keep(job_id, wish)
+            log.info("ended", job=job_id, state=state, failed=len(wish.failed))
+
+
+def _standing(wish: Wish) -> Standing:
+    return Standing(wish.state, wish.priority, wish.life)
+
+
+def _slowly(names: Iterable[str]) -> Iterator[str]:
+    """The same, with a breath now and then for others."""
+    for number, name in enumerate(names):
+        if number % PAGE == PAGE - 1:
+            time.sleep(BREATH)
+        yield name
