@@ -82,10 +82,11 @@ class Splash {
   private:
     // Air tears the mist: thin places open first.
     float torn(float mist, const Vec3f& p) const {
+        // Falling, it is drawn out into fingers.
         const float time = burst_.time();
-        const float air = noise::fractal((p - Vec3f(0.0F, 0.25F * time, 0.0F)) * 13.0F, 2.0F * time,
-                                         burst_.seed() ^ 0x33U, 4);
-        return std::max(0.0F, mist * (1.0F + 1.6F * air) - 0.006F * (0.35F - air));
+        const Vec3f q = (p - Vec3f(0.10F, 0.10F, 0.0F) * time) * Vec3f(21.0F, 12.0F, 21.0F);
+        const float air = noise::fractal(q, 2.0F * time, burst_.seed() ^ 0x33U, 5);
+        return mist * std::clamp(0.35F + 2.6F * air, 0.0F, 2.0F);
     }
 
     float voxel_;
