@@ -2,6 +2,7 @@
 // Accurate to the march's step, and dear.
 #include "first_event.h"
 #include "methods.h"
+#include "walk.h"
 
 namespace pileus {
 
@@ -18,19 +19,14 @@ class Density final : public Method {
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
-        auto event = first_event(scene_, ray, random, walk, march_, record);
-        for (int order = 0; event; ++order) {
-            light_.add(*event, order, order + 1, random, record);
-            if (order + 1 == orders_) return;
-            const float u1 = walk.uniform(), u2 = walk.uniform();
-            event->direction = medium.phase().sample(event->direction, u1, u2);
-            const LocalRay ray_on = medium.ray(event->position, event->direction);
-            march_.march(medium, ray_on, walk.uniform());
-            if (march_.opacity() <= 0.0f) return;
-            event->position = ray_on.at(march_.invert(walk.uniform()));
-            event->weight *= medium.albedo() * march_.opacity();
-            if (event->weight == Color(0.0f)) return;
-        }
+        const auto event = first_event(scene_, ray, random, walk, march_, record);
+        if (!event) return;
+        walk_on(medium, *event, orders_, light_, random, walk, record,
+                [&](const LocalRay& onward) -> std::optional<NextEvent> {
+                    march_.march(medium, onward, walk.uniform());
+                    if (march_.opacity() <= 0.0f) return std::nullopt;
+                    return NextEvent{onward.at(march_.invert(walk.uniform())), march_.opacity()};
+                });
     }
 
   private:

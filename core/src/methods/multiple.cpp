@@ -10,8 +10,7 @@
 #include "../tracking.h"
 #include "first_event.h"
 #include "methods.h"
-
-#include <cmath>
+#include "walk.h"
 
 namespace pileus {
 
@@ -28,31 +27,24 @@ class Multiple final : public Method {
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
-        auto event = first_event(scene_, ray, random, walk, march_, record);
+        const auto event = first_event(scene_, ray, random, walk, march_, record);
         if (!event) return;
         float local = medium.extinction(event->position);
-        for (int order = 0;; ++order) {
-            light_.add(*event, order, order + 1, random, record);
-            if (order + 1 == orders_) return;
-            const float u1 = order == 0 ? random.second()[2] : walk.uniform();
-            const float u2 = order == 0 ? random.second()[3] : walk.uniform();
-            event->direction = medium.phase().sample(event->direction, u1, u2);
-            LocalRay step = medium.ray(event->position, event->direction);
-            if (local > 0.0f) {
-                step.origin = step.at(walk.exponential() / local);
-                if (!medium.inside(step.origin)) return;
-                local = medium.extinction(step.origin);
-            }
-            if (local == 0.0f) {
-                const auto distance = delta_track(medium, step, walk.exponential(), walk);
-                if (!distance) return;
-                step.origin = step.at(*distance);
-                local = medium.extinction(step.origin);
-            }
-            event->position = step.origin;
-            event->weight *= medium.albedo();
-            if (event->weight == Color(0.0f)) return;
-        }
+        walk_on(medium, *event, orders_, light_, random, walk, record,
+                [&](LocalRay step) -> std::optional<NextEvent> {
+                    if (local > 0.0f) {
+                        step.origin = step.at(walk.exponential() / local);
+                        if (!medium.inside(step.origin)) return std::nullopt;
+                        local = medium.extinction(step.origin);
+                    }
+                    if (local == 0.0f) {
+                        const auto distance = delta_track(medium, step, walk.exponential(), walk);
+                        if (!distance) return std::nullopt;
+                        step.origin = step.at(*distance);
+                        local = medium.extinction(step.origin);
+                    }
+                    return NextEvent{step.origin, 1.0f};
+                });
     }
 
   private:
