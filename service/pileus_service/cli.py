@@ -18,6 +18,19 @@ from pileus_service import __version__, doctor, terminal
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.jobs import JobState
+from pileus_service.options import (
+    DATA,
+    LISTEN,
+    REDIS,
+    AsJson,
+    Data,
+    Frames,
+    Listen,
+    Redis,
+    RootFolders,
+    Sets,
+    ShotFile,
+)
 from pileus_service.queue import connect
 from pileus_service.shotfile import load_shot
 from pileus_service.watching import picture, show_until_ended, wait_for
@@ -28,9 +41,8 @@ Server = Annotated[
 Token = Annotated[
     str | None, typer.Option(envvar="PILEUS_TOKEN", help="The service's token.", metavar="TOKEN")
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.")]
-LOCAL = "http://127.0.0.1:8765"
+LOCAL = f"http://{LISTEN}"
 
 
 class Commands(TyperGroup):
@@ -86,13 +98,11 @@ def program(
 
 @app.command()
 def submit(
-    shot: Annotated[Path, typer.Argument(help="The shot, TOML or JSON.")],
+    shot: ShotFile,
     server: Server = LOCAL,
     token: Token = None,
-    frames: Annotated[str | None, typer.Option(help='Only these, as "1-24x2".')] = None,
-    sets: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Overrides a value.")
-    ] = None,
+    frames: Frames = None,
+    sets: Sets = None,
     priority: Annotated[int, typer.Option(min=0, max=9, help="The higher the sooner.")] = 5,
     key: Annotated[str | None, typer.Option(help="Idempotency key: submit once.")] = None,
     webhook: Annotated[
@@ -256,16 +266,10 @@ def drain(
 
 @app.command()
 def service(
-    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
-        "pileus-data"
-    ),
-    redis: Annotated[str, typer.Option(envvar="PILEUS_REDIS", help="Redis's address.")] = (
-        "redis://127.0.0.1:6379/0"
-    ),
-    root: Annotated[
-        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
-    ] = None,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT")] = "127.0.0.1:8765",
+    data: Data = DATA,
+    redis: Redis = REDIS,
+    root: RootFolders = None,
+    listen: Listen = LISTEN,
 ) -> None:
     """Runs the HTTP service alone; workers join it through Redis and the data folder."""
     from pileus_service.server import serve  # a client need not load it

@@ -2,19 +2,17 @@
 
 import json
 import time
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pileus_service.auth import Role, Tokens
+from pileus_service.options import DATA, AsJson, Data
 
 app = typer.Typer(
     name="token", help="Makes, lists and revokes the service's tokens.", no_args_is_help=True
 )
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Whose it is: a-z, 0-9 and -.")]
-Data = Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")]
-DATA = Path("pileus-data")
 
 
 @app.command()
@@ -37,7 +35,7 @@ def revoke(name: Name, data: Data = DATA) -> None:
 @app.command("list")
 def list_tokens(
     data: Data = DATA,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Lists the tokens' names, roles and ages; the tokens themselves are not kept."""
     tokens = Tokens(data).all()

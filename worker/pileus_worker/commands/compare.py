@@ -11,6 +11,7 @@ import typer
 from numpy.typing import NDArray
 
 from pileus_service.errors import InputError
+from pileus_service.options import AsJson
 from pileus_worker.errors import plain_errors
 from pileus_worker.pictures import to_display, write_png
 
@@ -56,7 +57,7 @@ def compare(
     difference: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Writes |image - reference| here.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compares two images: relMSE, mean ratio, largest error."""
     x, r = read_rgb(image, look), read_rgb(reference, look)

@@ -13,6 +13,7 @@ import pileus_core as core
 import typer
 
 from pileus_service.jobs import Resolved
+from pileus_service.options import AsJson, Frames, Sets, ShotFile
 from pileus_service.progress import Display, Row, duration
 from pileus_service.shot import Shot
 from pileus_service.shotfile import check_files, load_shot
@@ -26,14 +27,12 @@ app = typer.Typer()
 
 @app.command("render")
 def render(
-    shot_file: Annotated[Path, typer.Argument(metavar="SHOT", help="The shot, TOML or JSON.")],
-    frames: Annotated[str | None, typer.Option(help='Only these, as "1-24x2".')] = None,
-    sets: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Overrides a value.")
-    ] = None,
+    shot_file: ShotFile,
+    frames: Frames = None,
+    sets: Sets = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Writes the images here.")] = None,
     threads: Annotated[int, typer.Option(min=0, max=1024, help="0 takes all cores.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Renders a shot here and now: no farm needed."""
     settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from pileus_service import logs
+from pileus_service.options import DATA, LISTEN, Data, Listen, RootFolders
 from pileus_worker.embedded import embedded_farm
 
 app = typer.Typer()
@@ -17,13 +18,9 @@ app = typer.Typer()
 @app.command("up")
 def up(
     workers: Annotated[int, typer.Option(min=1, max=256, help="How many worker processes.")] = 1,
-    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
-        "pileus-data"
-    ),
-    root: Annotated[
-        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
-    ] = None,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT")] = "127.0.0.1:8765",
+    data: Data = DATA,
+    root: RootFolders = None,
+    listen: Listen = LISTEN,
 ) -> None:
     """Runs a whole farm on this machine: Redis, service and workers. Ctrl-C ends all of it."""
     logs.configure()

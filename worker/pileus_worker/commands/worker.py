@@ -8,6 +8,7 @@ import typer
 
 from pileus_service import logs
 from pileus_service.framelog import FrameLog
+from pileus_service.options import DATA, REDIS, Data, Redis, RootFolders
 from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
 from pileus_service.store import Store
@@ -26,15 +27,9 @@ STALL_SECONDS = 300.0
 
 @app.command("worker")
 def worker(
-    data: Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")] = Path(
-        "pileus-data"
-    ),
-    redis: Annotated[str, typer.Option(envvar="PILEUS_REDIS", help="Redis's address.")] = (
-        "redis://127.0.0.1:6379/0"
-    ),
-    root: Annotated[
-        list[Path] | None, typer.Option(help="A folder that shots may use; repeatable.")
-    ] = None,
+    data: Data = DATA,
+    redis: Redis = REDIS,
+    root: RootFolders = None,
     maps: Annotated[
         list[str] | None,
         typer.Option(
