@@ -4,6 +4,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -175,10 +176,32 @@ def test_a_change_that_redis_forgot_is_made_again(
     wait_for(lambda: farm.queue.state(job) == "paused")
 
 
+def test_of_many_listeners_each_hears_the_end_once(
+    client: TestClient, farm: Farm, shot: dict[str, Any]
+) -> None:
+    job = submit(client, {**shot, "frames": "1"})
+
+    def listen() -> list[str]:
+        with client.stream("GET", f"/v1/jobs/{job}/events") as answer:
+            lines = [line[5:] for line in answer.iter_lines() if line.startswith("data:")]
+        return [json.loads(line)["state"] for line in lines]
+
+    with ThreadPoolExecutor(24) as crowd:
+        heard = [crowd.submit(listen) for _ in range(20)]
+        client.post(f"/v1/jobs/{job}/pause")
+        heard += [crowd.submit(listen) for _ in range(4)]  # late, and told by the same look
+        time.sleep(1.5)
+        client.post(f"/v1/jobs/{job}/resume")
+        work(farm.queue)
+        told = [each.result(30) for each in heard]
+    assert all(states[-1] == "done" and states.count("done") == 1 for states in told), told
+    assert all("paused" in states for states in told), told
+
+
 def test_no_redis_is_a_problem_not_a_stack_trace(farm: Farm, shot: dict[str, Any]) -> None:
     dead = Redis.from_url("unix:///nowhere/redis", decode_responses=True)
     app: FastAPI = create_app(Farm(farm.store, Queue(dead), farm.roots), Guard())
     client = TestClient(app, base_url=LOCAL)
-    assert "Redis" in problem(client.get("/v1/jobs"), 503)
+    assert "nothing listens" in problem(client.get("/v1/jobs"), 503)
     problem(client.get("/readyz"), 503)
     assert client.get("/healthz").is_success

@@ -208,6 +208,22 @@ def test_the_time_left_counts_no_time_that_a_job_was_paused(queue: Queue) -> Non
     assert seen.seconds_left < 600
 
 
+def test_the_time_left_of_a_retried_job_counts_no_time_since_it_failed(queue: Queue) -> None:
+    submit(queue, frames=2)
+    while not queue.failed("job"):
+        queue.fail(take(queue), "A", "no disk")
+    while task := queue.claim(A):
+        do(queue, task)
+    assert view(queue)[0] == "failed"
+    for moment in ("started", "finished"):  # as if it had been looked at an hour later
+        queue.redis.hincrby("pileus:job:job", moment, -3_600_000)
+    queue.control("job", "retry", 1)
+    do(queue, take(queue))
+    seen = queue.job("job")
+    assert seen and seen.seconds_left is not None
+    assert seen.seconds_left < 600
+
+
 def test_cancel_drops_waiting_tasks_and_is_seen_by_running_ones(queue: Queue) -> None:
     submit(queue, frames=3)
     running = take(queue)

@@ -204,12 +204,7 @@ def _jobs(farm: Farm, broadcast: Broadcast) -> APIRouter:
     async def events(job_id: Id) -> EventSourceResponse:
         """The job each time it changes, until it ends."""
         view = _found(await run_in_threadpool(farm.job, job_id), job_id)
-
-        async def told() -> AsyncIterator[dict[str, str]]:
-            async for change in broadcast.changes(view):
-                yield {"event": "job", "data": change.model_dump_json()}
-
-        return EventSourceResponse(told())
+        return EventSourceResponse(broadcast.events(view))
 
     return router
 

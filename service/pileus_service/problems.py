@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pileus_service.errors import InputError
 from pileus_service.headers import HEADERS
+from pileus_service.queue import trouble
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -93,7 +94,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RedisError)
     def no_redis(_: Request, error: RedisError) -> JSONResponse:
-        return _answer(503, "Redis does not answer; try again", [], {"Retry-After": "2"})
+        detail = f"Redis does not answer: {trouble(error)}; try again"
+        return _answer(503, detail, [], {"Retry-After": "2"})
 
     @app.exception_handler(OSError)
     def no_disk(_: Request, error: OSError) -> JSONResponse:

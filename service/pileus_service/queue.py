@@ -13,6 +13,13 @@ from typing import Any, Literal, NamedTuple, cast
 
 from redis import Redis
 from redis.backoff import ExponentialBackoff
+from redis.exceptions import (
+    AuthenticationError,
+    BusyLoadingError,
+    NoPermissionError,
+    OutOfMemoryError,
+    RedisError,
+)
 from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
@@ -64,12 +71,30 @@ def connect(url: str) -> "Redis":
             decode_responses=True,
             socket_timeout=2,
             socket_connect_timeout=2,
-            retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=2),
+            retry=Retry(ExponentialBackoff(cap=0.5, base=0.05), retries=1),
             retry_on_error=[*UNREACHABLE],
         )
     except (ValueError, AttributeError) as error:
         # Never the address itself: it may hold a password.
         raise InputError(f"--redis: {error}; write redis://HOST:PORT/0") from None
+
+
+def trouble(error: RedisError) -> str:
+    """What is the matter with Redis, in words of our own: an error's text may hold its address, and
+    that a password."""
+    if isinstance(error, AuthenticationError | NoPermissionError):
+        return "it refuses the farm's user or password"
+    if isinstance(error, BusyLoadingError):
+        return "it still reads its file"
+    if isinstance(error, OutOfMemoryError):
+        return "its memory is full"
+    if isinstance(error, RedisTimeoutError):
+        return "it timed out"
+    if isinstance(error, RedisConnectionError):
+        cause = error.__cause__ or error.__context__
+        refused = isinstance(cause, ConnectionRefusedError | FileNotFoundError)
+        return "nothing listens at its address" if refused else "the connection fails"
+    return "it refuses the command"
 
 
 class Queue:

@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from chaos.farm import Farm, until
+from chaos.farm import Farm, frozen, until
 from pileus_service.jobs import WorkerView
 from pileus_service.queue import Queue
 from pileus_service.shot import Shot
+from pileus_worker.commands.worker import GRACE
 from serial_render import same_bits
 
 
@@ -63,6 +64,23 @@ def test_sigterm_hands_back_what_takes_longer(cached_shot: Shot, tmp_path: Path)
         assert worker.task is not None
         assert worker.task.attempt == 1, "a task handed back has not failed"
         assert farm.queue.stats().get("leases_lost", 0) == 0
+
+
+@pytest.mark.parametrize("has_task", [False, True])
+def test_sigterm_is_obeyed_while_redis_does_not_answer(
+    cached_shot: Shot, tmp_path: Path, has_task: bool
+) -> None:
+    with Farm(tmp_path, [tmp_path], 1, task_seconds=600, options=("--grace=1",)) as farm:
+        if has_task:
+            farm.client.submit(with_samples(cached_shot, 100_000))
+            until(lambda: bool(at_work(farm)))
+        else:
+            farm.until_workers(1)
+        process = farm.workers[0].process
+        with frozen(farm.redis.pid):
+            time.sleep(1)  # by now it waits for an answer
+            process.terminate()
+            assert process.wait(GRACE) == 0
 
 
 @pytest.mark.parametrize("verb", ["pause", "cancel"])

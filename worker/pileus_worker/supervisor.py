@@ -198,6 +198,8 @@ class Supervisor:
         )
         self._child: Child | None = None
         self._output = Output()
+        # As Redis was when last spoken to: while it is away, nothing is told it that can be spared.
+        self._away = False
         # Jobs whose next cache is not read ahead: a child was lost that did so.
         self._wary: set[str] = set()
 
@@ -209,16 +211,18 @@ class Supervisor:
                 asked_at = time.monotonic()
                 try:
                     task = self._queue.claim(self.info)
+                    self._away = False
                 except RedisError as error:
                     # Away, loading, or its disk is full: it comes back, and we are here then.
                     log.warning("no tasks to be had", reason=str(error))
-                    task = None
+                    task, self._away = None, True
                 if task is None:
                     ending.asked.wait(IDLE * random.uniform(0.5, 1.5))
                 else:
                     self._attempt(task, asked_at, ending)
             try:
-                self._queue.leave(self.info.name)
+                if not self._away:
+                    self._queue.leave(self.info.name)
             except RedisError:
                 log.info("Redis is gone before us; nothing to say goodbye to")
         finally:
@@ -278,7 +282,8 @@ class Supervisor:
     ) -> None:
         """Tells the attempt's log and the farm's counters how it went."""
         try:
-            self._measures.add(account(task.kind, outcome, seconds, self._limits.threads))
+            if not self._away:
+                self._measures.add(account(task.kind, outcome, seconds, self._limits.threads))
         except RedisError as error:
             log.info("not counted", reason=str(error))
         told: dict[str, Any] = {"seconds": round(seconds, 3)}
@@ -300,6 +305,7 @@ class Supervisor:
             elif isinstance(outcome, child.Failed):
                 self._insist(ending)(self._queue.fail, task, self.info.name, outcome.reason)
         except RetryError:
+            self._away = True
             log.warning("Redis was not there to be told")
 
     def _watch(
@@ -339,7 +345,9 @@ class Supervisor:
                     if self._queue.state(task.job) != "running":
                         self._give_up(renderer, task)
                         return None
+                    self._away = False
             except RedisError as error:
+                self._away = True
                 log.warning("going on without Redis", reason=str(error))
                 if ending.asked.is_set():
                     return None

@@ -48,6 +48,8 @@ elseif verb == 'retry' and (open or state == 'failed') then
   for _, frame in ipairs(failed) do first = math.min(first, tonumber(frame)) end
   redis.call('HSET', key, 'next', first)
   if state == 'failed' then
+    local started, finished = unpack(redis.call('HMGET', key, 'started', 'finished'))
+    if started and finished then redis.call('HINCRBY', key, 'idle', now() - finished) end
     redis.call('HDEL', key, 'finished')
     set_state(job, 'running')
   else
