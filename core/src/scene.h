@@ -1,5 +1,5 @@
 // A frame to be rendered, resolved to plain values: what there is, how light moves through it, and
-// which pixels and samples are wanted.
+// which pixels there are.
 #pragma once
 
 #include "camera.h"

@@ -6,13 +6,16 @@
 #include <openvdb/openvdb.h>
 #include <tbb/global_control.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <filesystem>
 #include <gtest/gtest.h>
+#include <map>
 #include <stdexcept>
 #include <string>
 #include <unistd.h>
+#include <utility>
 
 namespace pileus {
 namespace {
@@ -24,7 +27,9 @@ struct Maker {
     std::int64_t (*make)(const std::string&, const MakeOptions&);
     std::int64_t fewest;  // active voxels at resolution 256
     std::int64_t most;
-    int axis;  // along which the mass moves between frames 4 and 8 of 24
+    double extinction;   // of its example
+    double least_depth;  // optical, through its heart
+    int axis;            // along which the mass moves between frames 4 and 8 of 24
 };
 
 struct Made {
@@ -152,6 +157,23 @@ TEST_P(MakeTest, DependsOnTheSeed) {
     EXPECT_GT(difference(*a.density, *b.density), 100.0);
 }
 
+TEST_P(MakeTest, IsOpaqueInItsHeart) {
+    const Made made = make({.frame = 14, .frames = 24, .resolution = 96, .seed = 0});
+    // Along the view, above the foam that lies on still water.
+    std::map<std::pair<int, int>, double> columns;
+    for (auto value = made.density->cbeginValueOn(); value; ++value) {
+        openvdb::CoordBBox box;
+        value.getBoundingBox(box);
+        for (auto ijk = box.begin(); ijk; ++ijk) {
+            if (made.density->indexToWorld(*ijk).y() < -0.2) continue;
+            columns[{(*ijk).x(), (*ijk).y()}] += *value * made.density->voxelSize().z();
+        }
+    }
+    double thickest = 0.0;
+    for (const auto& [place, length] : columns) thickest = std::max(thickest, length);
+    EXPECT_GT(GetParam().extinction * thickest, GetParam().least_depth);
+}
+
 TEST_P(MakeTest, RefusesWhatItCannotMake) {
     const std::string file = path("made.vdb");
     EXPECT_THROW(GetParam().make(file, {.resolution = 7}), std::invalid_argument);
@@ -162,11 +184,11 @@ TEST_P(MakeTest, RefusesWhatItCannotMake) {
     EXPECT_TRUE(fs::is_empty(folder_));
 }
 
-INSTANTIATE_TEST_SUITE_P(Both, MakeTest,
-                         testing::Values(Maker{"Cloud", &make_cloud, 2'000'000, 5'000'000, 0},
-                                         Maker{"Whitewater", &make_whitewater, 1'000'000, 4'000'000,
-                                               1}),
-                         [](const auto& info) { return std::string(info.param.name); });
+INSTANTIATE_TEST_SUITE_P(
+    Both, MakeTest,
+    testing::Values(Maker{"Cloud", &make_cloud, 2'000'000, 5'000'000, 160.0, 40.0, 0},
+                    Maker{"Whitewater", &make_whitewater, 1'000'000, 4'000'000, 2000.0, 500.0, 1}),
+    [](const auto& info) { return std::string(info.param.name); });
 
 }  // namespace
 }  // namespace pileus
