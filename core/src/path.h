@@ -36,10 +36,25 @@ class PathRandom {
     // The pixel's x and y, the distance to the first event, and there the choice of lobe.
     std::array<float, sobol::dimensions> first;
 
-    /// At the first event: the direction towards a light, and the walk's. Many paths have none.
+    /// At the first event: the direction towards a light. Many paths have none.
     const std::array<float, sobol::dimensions>& second() const {
         if (!second_) second_ = sobol::point(sample_, hash_key(pixel_key_, 1));
         return *second_;
+    }
+
+    /// What a walk needs to fly on from event n: two numbers for a direction and an optical depth.
+    /// For its first events they are stratified.
+    struct Onward {
+        float u1, u2, flight;
+    };
+    Onward onward(int n, Random& walk) const {
+        constexpr int stratified = 3;
+        if (n >= stratified) {
+            const float u1 = walk.uniform(), u2 = walk.uniform();
+            return {u1, u2, walk.exponential()};
+        }
+        const auto point = sobol::point(sample_, hash_key(pixel_key_, n + 2ULL));
+        return {point[0], point[1], exponential(point[2])};
     }
 
     Random stream(StreamPurpose purpose, std::uint64_t index = 0) const {

@@ -26,7 +26,7 @@ class Tracked final : public Method {
     void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
         Random walk = random.stream(walk_stream);
         const auto [opacity, depth] = forced_track(scene_.medium, *ray.volume, first_rate_,
-                                                   -std::log1p(-random.first[2]), walk);
+                                                   exponential(random.first[2]), walk);
         if (opacity == 0.0f) return;
         record.opacity = opacity;
         record.depth = (ray.entry_distance + depth) * ray.depth_per_distance;
@@ -34,14 +34,13 @@ class Tracked final : public Method {
         for (int n = 0;; ++n) {
             light_.add(event, n, n + 1, random, record);
             light_.add_bridges(event, n, events_, random, record);
-            const float u1 = n == 0 ? random.second()[2] : walk.uniform();
-            const float u2 = n == 0 ? random.second()[3] : walk.uniform();
+            const auto [u1, u2, free_flight] = random.onward(n, walk);
             const HenyeyGreenstein& phase = schedule_.at(n).phase();
             const V3f direction = phase.sample(event.direction, u1, u2);
             const float density = phase.density(event.direction, direction);
             const Medium& medium = schedule_.onward(n);
             const LocalRay flight = medium.ray(event.position, direction);
-            const auto distance = delta_track(medium, flight, walk.exponential(), walk);
+            const auto distance = delta_track(medium, flight, free_flight, walk);
             if (!distance) {
                 light_.add_escape(event, direction, density, n, record);
                 return;
