@@ -26,24 +26,18 @@ inline int bridge_length(float g) {
         std::min<float>(longest_bridge, std::ceil(std::log(spread) / std::log(g))));
 }
 
-/// The inverse densities of the directions that a walk chose last, the last one first; 0 before
-/// its first choice.
+/// The inverse densities of the directions that a walk chose last, summed: of none, of the last
+/// one, of the last two, and so on; of no more than there were.
 class RecentChoices {
   public:
-    void add(float density) {
-        std::shift_right(inverse_.begin(), inverse_.end(), 1);
-        inverse_[0] = 1.0f / density;
+    void add(float inverse_density) {
+        for (std::size_t i = longest_bridge; i > 0; --i) sums_[i] = sums_[i - 1] + inverse_density;
     }
 
-    /// The sums of none, of the last one, of the last two, and so on.
-    std::array<float, longest_bridge + 1> sums() const {
-        std::array<float, longest_bridge + 1> result{};
-        for (std::size_t i = 0; i < inverse_.size(); ++i) result[i + 1] = result[i] + inverse_[i];
-        return result;
-    }
+    float inverse(int choices) const { return sums_[static_cast<std::size_t>(choices)]; }
 
   private:
-    std::array<float, longest_bridge> inverse_{};
+    std::array<float, longest_bridge + 1> sums_{};
 };
 
 /// Directions that lead from a walk into a distant light, as many of the last ones as a bridge has
@@ -57,7 +51,7 @@ class Chain {
         for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
             const float u1 = random.uniform(), u2 = random.uniform();
             direction_[i] = phase.sample(next, u1, u2);
-            sum += 1.0f / phase.density(direction_[i], next);
+            sum += phase.inverse_density(direction_[i], next);
             inverse_[i] = sum;
             next = direction_[i];
         }

@@ -115,7 +115,7 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
                 hit ? lobe.density(event.direction, sample->direction) : 0.0f;
             float others = 0.0f;  // the inverse densities that the bridges weigh in
             if (!hit && bridged(first)) {
-                others = event.choices.sums()[static_cast<std::size_t>(reach_)];
+                others = event.choices.inverse(reach_);
             }
             Shadow shadow(onward, event.position, sample->direction, rate, stream);
             for (const Term& term : terms_) {
@@ -165,15 +165,14 @@ void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const P
         const std::optional<Chain>& way = chain(k, n, random);
         if (!way) continue;
         const LightSample& light = way->light();
-        const auto earlier = event.choices.sums();
         for (int length = 1; length <= reach_ && n + length < end && bridged(n + length);
              ++length) {
             // Of all choices of which a bridge leaves one to be evaluated.
             const float inverse = way->inverse(length) +
-                                  1.0f / phase.density(event.direction, way->first(length)) +
-                                  earlier[static_cast<std::size_t>(reach_ - length)];
-            const float odds = chance((n == 0 ? 4.0f : 2.0f) * pi / inverse);
-            if (event_stream.uniform() >= odds) continue;
+                                  phase.inverse_density(event.direction, way->first(length)) +
+                                  event.choices.inverse(reach_ - length);
+            const float brightness = (n == 0 ? 4.0f : 2.0f) * pi / inverse;
+            if (event_stream.uniform() >= chance(brightness)) continue;
             Random own(event_stream.bits());
             const auto arrival = fly(event, n, way->directions(length), own);
             if (!arrival) continue;
@@ -185,7 +184,8 @@ void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const P
                     term.phase.density(way->first(1), light.direction) * way->inverse(1) / inverse;
                 record.add(term.look, term.order,
                            arrival->weight * light.radiance *
-                               (term.weight * scattered / odds * shadow.transmittance(term.power)));
+                               (term.weight * scattered / chance(brightness) *
+                                shadow.transmittance(term.power)));
             }
         }
     }
@@ -227,13 +227,13 @@ std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, int n,
 /// events before it, is the medium's own and narrow.
 bool DirectLight::bridged(int n) const { return reach_ > 0 && schedule_.plain(n); }
 
-void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float density, int n,
-                             PathRecord& record) const {
+void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density,
+                             int n, PathRecord& record) const {
     if (!tracked_) return;
     const int order = schedule_.order(n);
     for (const auto& light : scene_.lights) {
         if (!light->can_be_hit()) continue;
-        const float share = density / (density + light->density(direction));
+        const float share = 1.0f / (1.0f + inverse_density * light->density(direction));
         const Color radiance = event.weight * light->radiance(direction) * share;
         for (std::size_t k = 0; k < looks_.size(); ++k) {
             if (looks_[k].physical()) record.add(k, order, radiance);

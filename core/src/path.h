@@ -142,8 +142,8 @@ class DirectLight {
                      PathRecord& record);
 
     /// Adds what a walk that has left the medium sees of the sky, for the physical looks: it
-    /// scattered into `direction` at event n with that phase density, and met nothing more.
-    void add_escape(const ScatterEvent& event, const V3f& direction, float density, int n,
+    /// scattered into `direction` at event n, of which 1 / density is given, and met nothing more.
+    void add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density, int n,
                     PathRecord& record) const;
 
   private:

@@ -12,17 +12,21 @@ namespace pileus {
 /// light's travel: before the event and after it.
 class HenyeyGreenstein {
   public:
-    explicit HenyeyGreenstein(float g) : g_(g) {}
+    explicit HenyeyGreenstein(float g)
+        : g_(g), scale_(4.0f * pi / ((1.0f - std::abs(g)) * (1.0f + std::abs(g)))) {}
 
     float g() const { return g_; }
 
     /// Probability density per steradian of leaving along `out` having come along `in`.
-    float density(const V3f& in, const V3f& out) const {
+    float density(const V3f& in, const V3f& out) const { return 1.0f / inverse_density(in, out); }
+
+    /// 1 / density, which costs less.
+    float inverse_density(const V3f& in, const V3f& out) const {
         // 1 + g^2 - 2 g cos(theta), written about the peak so that g near +-1 does not cancel.
         const float peak = g_ >= 0.0f ? (in - out).length2() : (in + out).length2();
         const float g = std::abs(g_);
         const float base = (1.0f - g) * (1.0f - g) + g * peak;
-        return (1.0f - g) * (1.0f + g) / (4.0f * pi * base * std::sqrt(base));
+        return scale_ * base * std::sqrt(base);
     }
 
     /// A direction drawn from `density`, from u1, u2 in [0, 1).
@@ -42,6 +46,7 @@ class HenyeyGreenstein {
     }
 
     float g_;
+    float scale_;  // 4 pi / (1 - g^2)
 };
 
 }  // namespace pileus

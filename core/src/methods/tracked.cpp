@@ -37,12 +37,12 @@ class Tracked final : public Method {
             const auto [u1, u2, free_flight] = random.onward(n, walk);
             const HenyeyGreenstein& phase = schedule_.at(n).phase();
             const V3f direction = phase.sample(event.direction, u1, u2);
-            const float density = phase.density(event.direction, direction);
+            const float inverse_density = phase.inverse_density(event.direction, direction);
             const Medium& medium = schedule_.onward(n);
             const LocalRay flight = medium.ray(event.position, direction);
             const auto distance = delta_track(medium, flight, free_flight, walk);
             if (!distance) {
-                light_.add_escape(event, direction, density, n, record);
+                light_.add_escape(event, direction, inverse_density, n, record);
                 return;
             }
             if (n + 1 == events_) {
@@ -52,7 +52,7 @@ class Tracked final : public Method {
             event.position = flight.at(*distance);
             event.direction = direction;
             event.weight *= medium.albedo();
-            event.choices.add(density);
+            event.choices.add(inverse_density);
             if (!survives(event.weight, opacity, walk)) return;
         }
     }
