@@ -107,8 +107,8 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         Random stream(event_stream.bits());
         const bool hit = light->can_be_hit();
         // The light's own directions ...
-        const float u1 = first == 0 ? random.second()[0] : stream.uniform();
-        const float u2 = first == 0 ? random.second()[1] : stream.uniform();
+        const float u1 = first == 0 ? random.light()[0] : stream.uniform();
+        const float u2 = first == 0 ? random.light()[1] : stream.uniform();
         if (const auto sample = light->sample(u1, u2)) {
             const float seen = phase.density(event.direction, sample->direction);
             const float lobe_density =
@@ -136,8 +136,8 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         if (!hit || all_walk_) continue;
         Random lobe_stream(stream.bits());
         const float choice = first == 0 ? random.first[3] : lobe_stream.uniform();
-        const float v1 = first == 0 ? random.second()[0] : lobe_stream.uniform();
-        const float v2 = first == 0 ? random.second()[1] : lobe_stream.uniform();
+        const float v1 = first == 0 ? random.light()[0] : lobe_stream.uniform();
+        const float v2 = first == 0 ? random.light()[1] : lobe_stream.uniform();
         const V3f direction = lobe.sample(event.direction, choice, v1, v2);
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);

@@ -27,34 +27,26 @@ enum StreamPurpose : std::uint64_t {
 /// streams named by what they are for, so that no part of a path can shift the numbers of another.
 class PathRandom {
   public:
-    PathRandom(std::uint64_t pixel_key, std::uint32_t sample)
-        : first(sobol::point(sample, hash_key(pixel_key, 0))),
-          pixel_key_(pixel_key),
-          sample_(sample),
-          key_(hash_key(pixel_key, sample + 2ULL)) {}
+    using Point = std::array<float, sobol::dimensions>;
 
-    // The pixel's x and y, the distance to the first event, and there the choice of lobe.
-    std::array<float, sobol::dimensions> first;
+    PathRandom(std::uint64_t pixel_key, std::uint32_t sample)
+        : pixel_key_(pixel_key),
+          sample_(sample),
+          key_(hash_key(pixel_key, sample)),
+          first(stratified(camera_points)) {}
 
     /// At the first event: the direction towards a light. Many paths have none.
-    const std::array<float, sobol::dimensions>& second() const {
-        if (!second_) second_ = sobol::point(sample_, hash_key(pixel_key_, 1));
-        return *second_;
+    const Point& light() const {
+        if (!light_) light_ = stratified(light_points);
+        return *light_;
     }
 
-    /// What a walk needs to fly on from event n: two numbers for a direction and an optical depth.
+    /// With what a walk goes on from event n: two numbers for the direction and one for the flight.
     /// For its first events they are stratified.
-    struct Onward {
-        float u1, u2, flight;
-    };
-    Onward onward(int n, Random& walk) const {
-        constexpr int stratified = 3;
-        if (n >= stratified) {
-            const float u1 = walk.uniform(), u2 = walk.uniform();
-            return {u1, u2, walk.exponential()};
-        }
-        const auto point = sobol::point(sample_, hash_key(pixel_key_, n + 2ULL));
-        return {point[0], point[1], exponential(point[2])};
+    std::array<float, 3> onward(int n, Random& walk) const {
+        if (n >= 3) return {walk.uniform(), walk.uniform(), walk.uniform()};
+        const Point point = stratified(walk_points + static_cast<std::uint64_t>(n));
+        return {point[0], point[1], point[2]};
     }
 
     Random stream(StreamPurpose purpose, std::uint64_t index = 0) const {
@@ -62,10 +54,22 @@ class PathRandom {
     }
 
   private:
+    // Sequences of the pixel, of which each sample has a point. Their keys lie beyond the samples'.
+    static constexpr std::uint64_t camera_points = 1ULL << 32, light_points = camera_points + 1,
+                                   walk_points = camera_points + 2;
+
+    Point stratified(std::uint64_t sequence) const {
+        return sobol::point(sample_, hash_key(pixel_key_, sequence));
+    }
+
     std::uint64_t pixel_key_;
     std::uint32_t sample_;
     std::uint64_t key_;
-    mutable std::optional<std::array<float, sobol::dimensions>> second_;
+    mutable std::optional<Point> light_;
+
+  public:
+    /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
+    const Point first;
 };
 
 /// What one path finds: by look, and by order where they are wanted apart.

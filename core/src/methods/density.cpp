@@ -22,10 +22,10 @@ class Density final : public Method {
         const auto event = first_event(scene_, ray, random, walk, march_, record);
         if (!event) return;
         walk_on(medium, *event, orders_, light_, random, walk, record,
-                [&](const LocalRay& onward) -> std::optional<NextEvent> {
+                [&](const LocalRay& onward, float u) -> std::optional<NextEvent> {
                     march_.march(medium, onward, walk.uniform());
                     if (march_.opacity() <= 0.0f) return std::nullopt;
-                    return NextEvent{onward.at(march_.invert(walk.uniform())), march_.opacity()};
+                    return NextEvent{onward.at(march_.invert(u)), march_.opacity()};
                 });
     }
 

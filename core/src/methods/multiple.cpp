@@ -31,9 +31,9 @@ class Multiple final : public Method {
         if (!event) return;
         float local = medium.extinction(event->position);
         walk_on(medium, *event, orders_, light_, random, walk, record,
-                [&](LocalRay step) -> std::optional<NextEvent> {
+                [&](LocalRay step, float u) -> std::optional<NextEvent> {
                     if (local > 0.0f) {
-                        step.origin = step.at(walk.exponential() / local);
+                        step.origin = step.at(exponential(u) / local);
                         if (!medium.inside(step.origin)) return std::nullopt;
                         local = medium.extinction(step.origin);
                     }

@@ -34,13 +34,13 @@ class Tracked final : public Method {
         for (int n = 0;; ++n) {
             light_.add(event, n, n + 1, random, record);
             light_.add_bridges(event, n, events_, random, record);
-            const auto [u1, u2, free_flight] = random.onward(n, walk);
+            const auto [u1, u2, u3] = random.onward(n, walk);
             const HenyeyGreenstein& phase = schedule_.at(n).phase();
             const V3f direction = phase.sample(event.direction, u1, u2);
             const float inverse_density = phase.inverse_density(event.direction, direction);
             const Medium& medium = schedule_.onward(n);
             const LocalRay flight = medium.ray(event.position, direction);
-            const auto distance = delta_track(medium, flight, free_flight, walk);
+            const auto distance = delta_track(medium, flight, exponential(u3), walk);
             if (!distance) {
                 light_.add_escape(event, direction, inverse_density, n, record);
                 return;

@@ -14,18 +14,18 @@ struct NextEvent {
 };
 
 /// Gathers direct light at the event and at those that follow, at most `orders` of them.
-/// `next(LocalRay) -> std::optional<NextEvent>` finds the next event of a ray from the last; a path
-/// ends where there is none.
+/// `next(LocalRay, u) -> std::optional<NextEvent>` finds the next event of a ray from the last by a
+/// number u in [0, 1); a path ends where there is none.
 template <typename Next>
 void walk_on(const Medium& medium, ScatterEvent event, int orders, DirectLight& light,
              const PathRandom& random, Random& walk, PathRecord& record, const Next& next) {
     for (int order = 0;; ++order) {
         light.add(event, order, order + 1, random, record);
         if (order + 1 == orders) return;
-        const float u1 = order == 0 ? random.second()[2] : walk.uniform();
-        const float u2 = order == 0 ? random.second()[3] : walk.uniform();
+        const auto [u1, u2, u3] = random.onward(order, walk);
         event.direction = medium.phase().sample(event.direction, u1, u2);
-        const std::optional<NextEvent> found = next(medium.ray(event.position, event.direction));
+        const std::optional<NextEvent> found =
+            next(medium.ray(event.position, event.direction), u3);
         if (!found) return;
         event.position = found->position;
         event.weight *= medium.albedo() * found->weight;
