@@ -33,7 +33,7 @@ test: lint build/.built
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest
 
-test-slow: lint build/.built $(VENV)/.slow
+test-slow: lint build/.built $(VENV)/.slow sanitize
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest -m ''
 
@@ -94,11 +94,15 @@ build/.built: $(CORE) $(VENV)/.system
 	@touch $@
 
 .PHONY: sanitize
-# The core's tests under the address and the undefined behaviour sanitizers; half an hour the first time.
+# The core's tests under the address and the undefined behaviour sanitizers, and renders by several
+# threads under the thread sanitizer; half an hour the first time.
 sanitize: $(VENV)/.system
 	cmake -S core -B build/address -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=address,undefined
 	cmake --build build/address --parallel $(JOBS)
 	ctest --test-dir build/address --output-on-failure --parallel $(JOBS)
+	cmake -S core -B build/thread -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=thread
+	cmake --build build/thread --target pileus_threads_test --parallel $(JOBS)
+	TSAN_OPTIONS=suppressions=core/tests/thread.supp build/thread/pileus_threads_test
 
 clean:
 	rm -rf $(VENV) build demo chart

@@ -2,7 +2,8 @@
 
     PYTHONPATH=tests .venv/bin/python -m farm.overhead --repeat 3
 
-They take turns in one run; the figure is the ratio of the medians.
+They take turns in one run, both at the priority that the farm gives rendering; the figure is the
+ratio of the medians.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import pileus_core as core
 
 from pileus_service.client import Client
 from pileus_service.shot import Shot
+from pileus_worker.child import NICE
 from pileus_worker.embedded import embedded_farm
 
 
@@ -65,7 +67,7 @@ def main() -> None:
             for _ in range(asked.repeat):
                 begun = time.monotonic()
                 subprocess.run(
-                    [pileus, "render", file, "--out", folder / "here"],
+                    ["nice", f"-n{NICE}", pileus, "render", file, "--out", folder / "here"],
                     check=True,
                     capture_output=True,
                 )

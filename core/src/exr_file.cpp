@@ -173,6 +173,16 @@ void write_exr(const std::string& path, const LayeredImage& image, int width, in
     }
 }
 
+namespace {
+
+std::vector<std::string> printable(const std::vector<std::string>& texts) {
+    std::vector<std::string> lines;
+    for (const std::string& text : texts) lines.push_back(pileus::printable(text));
+    return lines;
+}
+
+}  // namespace
+
 ExrFile read_exr(const std::string& path) {
     try {
         Imf::MultiPartInputFile file(path.c_str());
@@ -201,7 +211,8 @@ ExrFile read_exr(const std::string& path) {
                              static_cast<double>(channels.size() * looks.size());
         if (least / tightest > static_cast<double>(std::filesystem::file_size(path)))
             throw InputError("it is too short for its size");
-        result.image = LayeredImage(window, looks, channels);
+        // What the file calls its parts and channels, and says of itself, goes into messages.
+        result.image = LayeredImage(window, printable(looks), printable(channels));
         for (int p = 0; p < file.parts(); ++p) {
             Imf::FrameBuffer buffer;
             for (std::size_t c = 0; c < channels.size(); ++c) {
@@ -215,13 +226,13 @@ ExrFile read_exr(const std::string& path) {
         }
         for (auto it = file.header(0).begin(); it != file.header(0).end(); ++it) {
             if (const auto* text = dynamic_cast<const Imf::StringAttribute*>(&it.attribute())) {
-                result.text[it.name()] = text->value();
+                result.text[pileus::printable(it.name())] = pileus::printable(text->value());
             }
         }
         return result;
     } catch (const std::exception& error) {
-        throw InputError(path + ": cannot be read as an EXR image (" + printable(error.what()) +
-                         ")");
+        throw InputError(path + ": cannot be read as an EXR image (" +
+                         pileus::printable(error.what()) + ")");
     }
 }
 
