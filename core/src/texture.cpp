@@ -10,7 +10,9 @@ namespace pileus {
 Texture read_texture(const std::string& path) {
     using Read = void(const std::string&, Texture&, std::string&);
     static void* const library = ::dlopen("libpileus_texture.so", RTLD_NOW | RTLD_LOCAL);
-    if (!library) throw std::runtime_error(path + ": " + ::dlerror());
+    // dlerror tells its reason once.
+    static const std::string reason = library ? "" : ::dlerror();
+    if (!library) throw std::runtime_error(path + ": " + reason);
     static auto* const read = reinterpret_cast<Read*>(::dlsym(library, "pileus_read_texture"));
     Texture texture;
     std::string trouble;
