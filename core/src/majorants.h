@@ -26,6 +26,10 @@ struct MajorantSegment {
     BrickTree::Cursor brick;
 };
 
+/// Three axes and a spare lane, for arithmetic on all at once (GCC's and Clang's vectors).
+using Floats4 = float __attribute__((vector_size(16)));
+using Ints4 = int __attribute__((vector_size(16)));
+
 class MajorantIterator {
   public:
     /// From the ray's origin onward, or from where it enters the tree.
@@ -34,6 +38,7 @@ class MajorantIterator {
         float enter = 0.0f, leave = std::numeric_limits<float>::infinity();
         for (int axis = 0; axis < 3; ++axis) {
             const float d = ray.direction[axis];
+            origin_[axis] = ray.origin[axis];
             // A ray along the other axes takes forever to cross this one.
             inverse_[axis] = std::abs(d) > 1e-30f ? 1.0f / d : 1e30f;
             const bool forward = inverse_[axis] > 0.0f;
@@ -51,15 +56,17 @@ class MajorantIterator {
         for (int axis = 0; axis < 3; ++axis) {
             brick_[axis] = brick_of(std::clamp(BrickTree::floor_int(start[axis]), tree.low()[axis],
                                                tree.high()[axis] - 1));
-            exit_[axis] = distance(axis, brick_[axis] + ahead_[axis]);
         }
+        find_exits();
     }
 
     /// The next stretch that may hold anything. False where there is none.
     bool next(MajorantSegment& segment) {
         while (inside_) {
+            const V3i brick(brick_[0], brick_[1], brick_[2]);
             if (!node_) {
-                const BrickTree::Cells cells = tree_->cells(brick_);
+                if (!tree_->contains(brick)) break;
+                const BrickTree::Cells cells = tree_->cells(brick);
                 node_ = cells.lowest;
                 if (!node_) {
                     segment = {t_, 0.0f, cells.majorant, {}};
@@ -69,14 +76,14 @@ class MajorantIterator {
                     continue;
                 }
             }
-            segment = {t_,
-                       0.0f,
-                       tree_->majorant(*node_, brick_),
-                       {brick_, BrickTree::child(*node_, brick_)}};
+            segment.begin = t_;
+            segment.majorant = tree_->majorant(*node_, brick);
+            if (segment.majorant > 0.0f) segment.brick = {brick, BrickTree::child(*node_, brick)};
             step();
             segment.end = t_;
             if (segment.majorant > 0.0f && segment.end > segment.begin) return true;
         }
+        inside_ = false;
         return false;
     }
 
@@ -86,24 +93,30 @@ class MajorantIterator {
 
     /// The distance along the ray to a plane across an axis.
     float distance(int axis, int plane) const {
-        return (static_cast<float>(plane) - ray_.origin[axis]) * inverse_[axis];
+        return (static_cast<float>(plane) - origin_[axis]) * inverse_[axis];
     }
 
-    /// To the next brick.
+    void find_exits() {
+        exit_ = (__builtin_convertvector(brick_ + ahead_, Floats4) - origin_) * inverse_;
+    }
+
+    /// To the next brick. No lane is chosen by a branch: which axis comes next cannot be foretold.
     void step() {
-        int axis = exit_[1] < exit_[0] ? 1 : 0;
-        axis = exit_[2] < exit_[axis] ? 2 : axis;
-        t_ = std::max(t_, exit_[axis]);
+        const Floats4 swapped = __builtin_shufflevector(exit_, exit_, 1, 0, 3, 2);
+        const Floats4 pairs = exit_ < swapped ? exit_ : swapped;
+        const Floats4 turned = __builtin_shufflevector(pairs, pairs, 2, 3, 0, 1);
+        const Floats4 nearest = pairs < turned ? pairs : turned;
+        t_ = std::max(t_, nearest[0]);
         if (!(t_ < end_)) {
             t_ = end_;
             inside_ = false;
             return;
         }
-        const int left = brick_[axis];
-        brick_[axis] = left + step_[axis];
-        exit_[axis] = distance(axis, brick_[axis] + ahead_[axis]);
-        if ((left ^ brick_[axis]) & ~(width * width - 1)) node_ = nullptr;
-        inside_ = brick_[axis] >= 0 && brick_[axis] < tree_->extent();
+        const Ints4 left = brick_;
+        brick_ += step_ & (exit_ <= nearest);
+        find_exits();
+        const Ints4 beyond = (left ^ brick_) & ~(width * width - 1);
+        if (beyond[0] | beyond[1] | beyond[2]) node_ = nullptr;
     }
 
     /// To the first brick beyond a larger box.
@@ -131,17 +144,18 @@ class MajorantIterator {
                                  : std::clamp(BrickTree::floor_int(p[axis]), cells.low[axis],
                                               cells.low[axis] + cells.size - 1);
             brick_[axis] = brick_of(cell);
-            exit_[axis] = distance(axis, brick_[axis] + ahead_[axis]);
         }
-        inside_ = brick_[exit] >= 0 && brick_[exit] < tree_->extent();
+        find_exits();
     }
 
     const BrickTree* tree_;
     LocalRay ray_;
-    V3f inverse_{0.0f};
-    V3i step_{0}, ahead_{0};  // to the next brick, and from a brick's low to its far side
-    V3i brick_{0};            // the low corner of the brick that comes next
-    V3f exit_{0.0f};          // where the ray leaves it, across each axis
+    // The spare lane's exit is never reached.
+    Floats4 origin_{0.0f, 0.0f, 0.0f, -1.0f};
+    Floats4 inverse_{0.0f, 0.0f, 0.0f, std::numeric_limits<float>::infinity()};
+    Ints4 step_{}, ahead_{};  // to the next brick, and from a brick's low to its far side
+    Ints4 brick_{};           // the low corner of the brick that comes next
+    Floats4 exit_{};          // where the ray leaves it, across each axis
     const BrickTree::Node* node_ = nullptr;  // the lowest node around it, once known
     float t_ = 0.0f, end_ = 0.0f;
     bool inside_ = false;
