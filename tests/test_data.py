@@ -17,7 +17,7 @@ def assert_renders(volume: pileus_core.Volume) -> None:
         extinction = 1.0
     else:
         low, high = (np.asarray(corner) for corner in volume.world_bounds)
-        extinction = 20.0 / float(np.linalg.norm(high - low))
+        extinction = 200.0 / float(np.linalg.norm(high - low))
     lights = [
         pileus_core.DistantLight(direction=(0.3, -1, -0.4), irradiance=(2, 2, 2)),
         pileus_core.DomeLight(radiance=(0.5, 0.5, 0.5)),
@@ -32,7 +32,7 @@ def assert_renders(volume: pileus_core.Volume) -> None:
         size=SIZE,
     )
     for method in ("multiple", "reference"):
-        image = render(scene, method, 4, SIZE)
+        image = render(scene, method, 16, SIZE)
         for name, values in image.items():
             assert np.isfinite(values).all(), name
             assert (values >= 0).all(), name
