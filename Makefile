@@ -100,7 +100,8 @@ build/.built: $(CORE) $(VENV)/.system
 sanitize: $(VENV)/.system
 	cmake -S core -B build/address -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=address,undefined
 	cmake --build build/address --parallel $(JOBS)
-	LD_LIBRARY_PATH=$(CURDIR)/build/address ctest --test-dir build/address --output-on-failure --parallel $(JOBS)
+	LD_LIBRARY_PATH=$(CURDIR)/build/address LSAN_OPTIONS=suppressions=$(CURDIR)/core/tests/leak.supp \
+	    ctest --test-dir build/address --output-on-failure --parallel $(JOBS)
 	cmake -S core -B build/thread -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=thread
 	cmake --build build/thread --target pileus_threads_test --parallel $(JOBS)
 	TSAN_OPTIONS=suppressions=core/tests/thread.supp build/thread/pileus_threads_test
