@@ -96,12 +96,15 @@ build/.built: $(CORE) $(VENV)/.system
 .PHONY: sanitize
 # The core's tests under the address and the undefined behaviour sanitizers, and renders by several
 # threads under the thread sanitizer; half an hour the first time. The sanitizer's dlopen does not look
-# where the caller's RUNPATH says, so the texture reader is to be found by LD_LIBRARY_PATH.
+# where the caller's RUNPATH says, so the texture reader is to be found by LD_LIBRARY_PATH. One test is left
+# out: of false counts OpenVDB asks for memory that nobody has, and the sanitizer's `new` then ends the program
+# where the library's throws; it also reads a file's bytes as bools.
 sanitize: $(VENV)/.system
 	cmake -S core -B build/address -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=address,undefined
 	cmake --build build/address --parallel $(JOBS)
 	LD_LIBRARY_PATH=$(CURDIR)/build/address LSAN_OPTIONS=suppressions=$(CURDIR)/core/tests/leak.supp \
-	    ctest --test-dir build/address --output-on-failure --parallel $(JOBS)
+	    ctest --test-dir build/address --exclude-regex RefusesCountsBeyondTheFile \
+	    --output-on-failure --parallel $(JOBS)
 	cmake -S core -B build/thread -G Ninja -DCMAKE_BUILD_TYPE=None -DPILEUS_SANITIZE=thread
 	cmake --build build/thread --target pileus_threads_test --parallel $(JOBS)
 	TSAN_OPTIONS=suppressions=core/tests/thread.supp build/thread/pileus_threads_test
