@@ -175,10 +175,9 @@ void write_exr(const std::string& path, const LayeredImage& image, int width, in
 
 namespace {
 
-std::vector<std::string> printable(const std::vector<std::string>& texts) {
-    std::vector<std::string> lines;
-    for (const std::string& text : texts) lines.push_back(pileus::printable(text));
-    return lines;
+std::vector<std::string> all_printable(std::vector<std::string> texts) {
+    for (std::string& text : texts) text = printable(text);
+    return texts;
 }
 
 }  // namespace
@@ -212,7 +211,7 @@ ExrFile read_exr(const std::string& path) {
         if (least / tightest > static_cast<double>(std::filesystem::file_size(path)))
             throw InputError("it is too short for its size");
         // What the file calls its parts and channels, and says of itself, goes into messages.
-        result.image = LayeredImage(window, printable(looks), printable(channels));
+        result.image = LayeredImage(window, all_printable(looks), all_printable(channels));
         for (int p = 0; p < file.parts(); ++p) {
             Imf::FrameBuffer buffer;
             for (std::size_t c = 0; c < channels.size(); ++c) {
@@ -226,13 +225,13 @@ ExrFile read_exr(const std::string& path) {
         }
         for (auto it = file.header(0).begin(); it != file.header(0).end(); ++it) {
             if (const auto* text = dynamic_cast<const Imf::StringAttribute*>(&it.attribute())) {
-                result.text[pileus::printable(it.name())] = pileus::printable(text->value());
+                result.text[printable(it.name())] = printable(text->value());
             }
         }
         return result;
     } catch (const std::exception& error) {
-        throw InputError(path + ": cannot be read as an EXR image (" +
-                         pileus::printable(error.what()) + ")");
+        throw InputError(path + ": cannot be read as an EXR image (" + printable(error.what()) +
+                         ")");
     }
 }
 

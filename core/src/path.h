@@ -30,10 +30,13 @@ class PathRandom {
     using Point = std::array<float, sobol::dimensions>;
 
     PathRandom(std::uint64_t pixel_key, std::uint32_t sample)
-        : pixel_key_(pixel_key),
+        : first(sobol::point(sample, hash_key(pixel_key, camera_points))),
+          pixel_key_(pixel_key),
           sample_(sample),
-          key_(hash_key(pixel_key, sample)),
-          first(stratified(camera_points)) {}
+          key_(hash_key(pixel_key, sample)) {}
+
+    /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
+    const Point first;
 
     /// At the first event: the direction towards a light. Many paths have none.
     const Point& light() const {
@@ -66,10 +69,6 @@ class PathRandom {
     std::uint32_t sample_;
     std::uint64_t key_;
     mutable std::optional<Point> light_;
-
-  public:
-    /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
-    const Point first;
 };
 
 /// What one path finds: by look, and by order where they are wanted apart.

@@ -89,7 +89,7 @@ class Broadcast:
         watched = self._watched.setdefault(job.id, _Watched())
         watched.listeners += 1
         try:
-            watched.say(job)  # nobody has read it later
+            watched.say(job)  # it was read just now
             told = 0
             while watched.said is not None:
                 if told != watched.number:
