@@ -1,15 +1,18 @@
 """The scenes: shot files, the caches that `caches.toml` says how to get, a frame made ready."""
 
+import hashlib
 import json
 import os
 import tomllib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pileus_core as core
 from numpy.typing import NDArray
+from pileus_core import _core
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from pileus_service.frames import expand
@@ -104,9 +107,9 @@ def load_scene(
 
 
 def _make(recipe: Recipe, shot: Shot) -> None:
-    """Makes the frames that are wanted; one made from another recipe is made again."""
+    """Makes the frames that are wanted; one of another recipe or maker is made again."""
     write = core.make_cloud if recipe.make == "cloud" else core.make_whitewater
-    stamp = json.dumps([recipe.model_dump(), core.__version__])
+    stamp = json.dumps([recipe.model_dump(), _maker()])
     for frame in shot.frame_numbers:
         path = cache_path(shot, frame)
         note = path.with_suffix(".recipe")
@@ -121,6 +124,12 @@ def _make(recipe: Recipe, shot: Shot) -> None:
             seed=recipe.seed,
         )
         note.write_text(stamp)
+
+
+@cache
+def _maker() -> str:
+    """What tells one build of the core from another."""
+    return hashlib.sha256(Path(_core.__file__).read_bytes()).hexdigest()
 
 
 def view_of(scene: BenchScene, frame: int, data: Path) -> dict[str, Any]:
