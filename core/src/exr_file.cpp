@@ -6,6 +6,7 @@
 #include <OpenEXR/ImfChannelList.h>
 #include <OpenEXR/ImfFloatAttribute.h>
 #include <OpenEXR/ImfFrameBuffer.h>
+#include <OpenEXR/ImfFramesPerSecond.h>
 #include <OpenEXR/ImfHeader.h>
 #include <OpenEXR/ImfInputPart.h>
 #include <OpenEXR/ImfMatrixAttribute.h>
@@ -42,7 +43,9 @@ void set_attribute(Imf::Header& header, const std::string& name, const HeaderVal
         }
         void operator()(float number) const { header.insert(name, Imf::FloatAttribute(number)); }
         void operator()(const std::pair<int, unsigned>& ratio) const {
-            header.insert(name, Imf::RationalAttribute(Imf::Rational(ratio.first, ratio.second)));
+            // 23.976 stands for 24000/1001.
+            const Imf::Rational rate(ratio.first, ratio.second);
+            header.insert(name, Imf::RationalAttribute(Imf::guessExactFps(rate)));
         }
         void operator()(const Imath::M44f& matrix) const {
             header.insert(name, Imf::M44fAttribute(matrix));
