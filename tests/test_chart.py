@@ -73,10 +73,11 @@ def test_every_scene_is_a_shot(tmp_path: Path) -> None:
 
 def test_a_scene_is_measured_and_its_truth_kept(tmp_path: Path) -> None:
     notes: list[str] = []
-    pythons = {each.renderer: sys.executable for each in PEERS} | {"pileus": sys.executable}
+    bare = str(Path(sys.base_prefix) / "bin" / "python3")
+    pythons = {each.renderer: bare for each in PEERS} | {"pileus": sys.executable}
     with Measurement(TINY, tmp_path, pythons, notes.append) as measurement:
         wanted = [each for each in methods() if each.name in ("single", "reference")]
-        # This interpreter has no peers: a line each, and the rest goes on.
+        # That interpreter has no peers: a line each, and the rest goes on.
         contenders = measurement.start([*wanted, *PEERS])
         assert contenders == wanted
         assert len(measurement.skipped) == 2
