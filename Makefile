@@ -95,7 +95,7 @@ build/.built: $(CORE) $(VENV)/.system
 
 .PHONY: sanitize
 # The core's tests under the address and the undefined behaviour sanitizers, and renders by several
-# threads under the thread sanitizer; half an hour the first time. The sanitizer's dlopen does not look
+# threads under the thread sanitizer; ten minutes the first time. The sanitizer's dlopen does not look
 # where the caller's RUNPATH says, so the texture reader is to be found by LD_LIBRARY_PATH. One test is left
 # out: of false counts OpenVDB asks for memory that nobody has, and the sanitizer's `new` then ends the program
 # where the library's throws; it also reads a file's bytes as bools.
