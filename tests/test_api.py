@@ -120,6 +120,7 @@ def test_health_metrics_and_the_api_page(client: TestClient, shot: dict[str, Any
     assert client.get("/healthz").json()["status"] == "ok"
     assert client.get("/readyz").is_success
     assert 'pileus_tasks_waiting{priority="3"} 2.0' in client.get("/metrics").text
+    wait_for(lambda: 'pileus_jobs{state="running"} 1.0' in client.get("/metrics").text)
     assert client.get("/docs").is_success
     document = client.get("/openapi.json")
     assert "/v1/jobs/{job_id}/frames/{frame}/preview.png" in document.json()["paths"]

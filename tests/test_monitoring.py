@@ -22,7 +22,7 @@ FOLDER = Path(__file__).parent.parent / "deploy" / "monitoring"
 def exposition(redis: Redis) -> str:
     queue = Queue(redis)
     queue.submit("job", "job", 0.0, 1, Wish())
-    return metrics.exposition(queue).decode()
+    return metrics.exposition(queue, {"running": 1}).decode()
 
 
 def expressions() -> dict[str, str]:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from redis import Redis
 
 from pileus_service.jobs import (
+    JobView,
     Kind,
     Merged,
     Planned,
@@ -484,6 +485,48 @@ def test_a_stale_plan_is_made_anew_a_bounded_number_of_times(queue: Queue) -> No
         do(queue, take(queue), tasks=2)
         assert queue.complete(take(queue), "A", Stale(stale="cloud.vdb changes"))
     assert queue.failed("job") == {0: "render failed: cloud.vdb changes"}
+
+
+def test_a_job_tells_the_first_of_its_failed_frames(queue: Queue) -> None:
+    submit(queue, frames=12)
+    while task := queue.claim(A):
+        if task.frame in (9, 10):
+            queue.fail(task, "A", f"no cache {task.frame}")
+        else:
+            do(queue, task)
+    seen = queue.job("job")
+    assert seen and (seen.frames_done, seen.frames_failed) == (10, 2)
+    assert seen.reason == "9: plan failed: A: no cache 9"
+
+
+def test_many_jobs_are_told_as_each_alone_is(queue: Queue) -> None:
+    names = [f"job{number}" for number in range(250)]
+    for number, job in enumerate(names):
+        submit(queue, job, frames=1 + number % 3, priority=number % 10)
+    for _ in range(150):
+        do(queue, take(queue))
+    running = take(queue)
+    queue.renew(running, A.model_copy(update={"samples": 7}))
+
+    def still(view: JobView | None) -> JobView | None:
+        return view and view.model_copy(update={"seconds_left": None})
+
+    together = queue.views([*names, "nobody"])
+    assert together.pop() is None
+    assert [*map(still, together)] == [still(queue.job(job)) for job in names]
+    assert len({view.state for view in together if view}) == 3
+    [frame] = next(view for view in together if view and view.id == running.job).active
+    assert frame.progress > 0
+
+
+def test_how_long_the_next_task_has_waited(queue: Queue) -> None:
+    submit(queue, frames=2)
+    time.sleep(0.2)
+    submit(queue, "later", priority=7)
+    lines = queue.lines()
+    assert lines[5].wait >= lines[7].wait + 0.2
+    first = take(queue)
+    assert (first.job, queue.lines()[7]) == ("later", (0, 1, 0.0))
 
 
 def test_unwanted_work_is_known_at_renewal(queue: Queue) -> None:

@@ -3,6 +3,7 @@ is noted on disk. The disk is the truth; what Redis lacks is built anew from it.
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 
 import structlog
@@ -61,6 +62,10 @@ class Agreement:
 
     def forget(self, job_id: str) -> None:
         self._wishes.pop(job_id, None)
+
+    def states(self) -> Counter[str]:
+        """How many jobs are in each state, as of the last look; those not begun are running."""
+        return Counter(wish.state for wish in list(self._wishes.values()))
 
     def restore(self, job_id: str) -> bool:
         """Puts a job of the disk into Redis; what it has finished stays finished."""

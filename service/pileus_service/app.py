@@ -103,7 +103,8 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
         responses=problems.GUARDED,
     )
     def prometheus() -> Response:
-        return Response(metrics.exposition(farm.queue), media_type="text/plain; version=0.0.4")
+        told = metrics.exposition(farm.queue, farm.agreement.states())
+        return Response(told, media_type="text/plain; version=0.0.4")
 
     @app.get("/healthz", tags=["farm"])
     def healthy() -> Health:

@@ -3,13 +3,13 @@
 The counters live in Redis, so every service of a farm tells the same; scrape one of them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from pileus_service.jobs import Cause, Kind
+from pileus_service.jobs import Cause, JobState, Kind
 from pileus_service.measures import Measures
 from pileus_service.queue import Queue
 
@@ -42,8 +42,9 @@ Family = CounterMetricFamily | GaugeMetricFamily
 
 
 class _FarmCollector(Collector):
-    def __init__(self, queue: Queue) -> None:
+    def __init__(self, queue: Queue, states: Mapping[str, int]) -> None:
         self._queue = queue
+        self._states = states
 
     def collect(self) -> Iterator[Family]:
         stats = self._queue.stats()
@@ -73,15 +74,15 @@ class _FarmCollector(Collector):
             "How long the task that is next has waited",
             labels=["priority"],
         )
-        for priority, (queued, leased) in self._queue.depths().items():
-            waiting.add_metric([str(priority)], queued)
-            held.add_metric([str(priority)], leased)
-        for priority, seconds in self._queue.waits().items():
-            age.add_metric([str(priority)], seconds)
+        for priority, line in self._queue.lines().items():
+            waiting.add_metric([str(priority)], line.waiting)
+            held.add_metric([str(priority)], line.held)
+            age.add_metric([str(priority)], line.wait)
         yield from (waiting, held, age)
         jobs = GaugeMetricFamily("pileus_jobs", "Jobs", labels=["state"])
-        for state, count in self._queue.jobs_by_state().items():
-            jobs.add_metric([state], count)
+        for state in JobState:
+            if state is not JobState.QUEUED:  # not told from those that have begun
+                jobs.add_metric([state], self._states.get(state, 0))
         yield jobs
 
     def _workers(self) -> Iterator[Family]:
@@ -96,7 +97,8 @@ class _FarmCollector(Collector):
             yield GaugeMetricFamily(f"pileus_{name}", text, value=value)
 
 
-def exposition(queue: Queue) -> bytes:
+def exposition(queue: Queue, states: Mapping[str, int]) -> bytes:
+    """`states` says how many jobs there are in each."""
     registry = CollectorRegistry()
-    registry.register(_FarmCollector(queue))
+    registry.register(_FarmCollector(queue, states))
     return generate_latest(registry)

@@ -6,7 +6,7 @@ flight: `pileus_service.store` is the truth.
 """
 
 import json
-from collections import Counter
+import math
 from collections.abc import Callable, Iterable, Sequence
 from importlib.resources import files
 from typing import Any, Literal, NamedTuple, cast
@@ -27,7 +27,6 @@ from redis.retry import Retry
 from pileus_service.errors import InputError, printable
 from pileus_service.jobs import (
     FORMAT,
-    JobState,
     JobView,
     Result,
     Task,
@@ -35,14 +34,15 @@ from pileus_service.jobs import (
     WorkerInfo,
     WorkerView,
 )
-from pileus_service.views import frame_view, job_view
+from pileus_service.views import job_view
 
 LEASE = 10.0
 RENEWAL = 2.5
 PRIORITIES = range(10)
 GROUP = "workers"
 SHARED = ("common", "issue", "attempts")
-SCRIPTS = ("submit", "claim", "renew", "complete", "release", "control")
+SCRIPTS = ("submit", "claim", "renew", "complete", "release", "control", "views")
+VIEWS = 100  # jobs that are looked at in one step, for which all others wait
 UNREACHABLE = (RedisConnectionError, RedisTimeoutError)
 
 Verb = Literal["pause", "resume", "cancel", "remove", "priority", "retry"]
@@ -54,6 +54,15 @@ class Standing(NamedTuple):
     state: str
     priority: int
     life: int
+
+
+class Line(NamedTuple):
+    """The tasks of a priority: how many wait, how many workers hold, and for how many seconds the
+    one that is next has waited."""
+
+    waiting: int
+    held: int
+    wait: float
 
 
 class Mark(NamedTuple):
@@ -150,31 +159,15 @@ class Queue:
         return self.views([job])[0]
 
     def views(self, jobs: Sequence[str]) -> list[JobView | None]:
-        """Jobs, in two round trips whatever their number and that of the workers."""
-        ask = self.redis.pipeline(transaction=False)
-        ask.time()
-        for job in jobs:
-            key = f"pileus:job:{job}"
-            ask.hgetall(key)
-            ask.hgetall(f"{key}:failed")
-            ask.hgetall(f"{key}:flight")
-            ask.zrange(f"{key}:active", 0, -1)
-        (seconds, micros), *told = ask.execute()
-        rows = [told[at : at + 4] for at in range(0, len(told), 4)]
-        for job, (_, _, _, active) in zip(jobs, rows, strict=True):
-            for frame in active:
-                ask.hgetall(f"pileus:job:{job}:frame:{frame}")
-        frames = iter(ask.execute())
+        """Jobs, in one round trip for each hundred of them."""
         views: list[JobView | None] = []
-        for job, (held, failed, flight, active) in zip(jobs, rows, strict=True):
-            in_flight: Counter[int] = Counter()
-            for entry in flight.values():
-                frame, samples = entry.split()
-                in_flight[int(frame)] += int(samples)
-            shown = [frame_view(int(index), next(frames), in_flight) for index in active]
-            in_order = [frame for frame in shown if frame]
-            now = seconds + micros / 1e6
-            views.append(job_view(job, held, failed, in_order, now) if held else None)
+        for at in range(0, len(jobs), VIEWS):
+            page = jobs[at : at + VIEWS]
+            now, rows = json.loads(self._run("views", *page))
+            views += [
+                job_view(job, row, now / 1000) if row else None
+                for job, row in zip(page, rows, strict=True)
+            ]
         return views
 
     def standings(self, jobs: Sequence[str]) -> list[Standing | None]:
@@ -271,35 +264,31 @@ class Queue:
         held = cast(dict[str, str], self.redis.hgetall("pileus:stats"))
         return {name: int(value) for name, value in held.items()}
 
+    def lines(self) -> dict[int, Line]:
+        """What waits and what is held, of each priority that has a stream."""
+        ask = self.redis.pipeline(transaction=False)
+        ask.time()
+        for priority in PRIORITIES:
+            ask.exists(f"pileus:tasks:{priority}")
+        (seconds, micros), *there = ask.execute()
+        streams = {each: f"pileus:tasks:{each}" for each in PRIORITIES if there[each]}
+        for stream in streams.values():
+            ask.xlen(stream)
+            ask.xinfo_groups(stream)
+        told = ask.execute()
+        held = [(length, group) for length, [group] in zip(told[::2], told[1::2], strict=True)]
+        for stream, (_, group) in zip(streams.values(), held, strict=True):
+            ask.xrange(stream, f"({group['last-delivered-id']}", "+", 1)
+        lines = {}
+        for priority, (length, group), ahead in zip(streams, held, ask.execute(), strict=True):
+            begun = int(ahead[0][0].split("-")[0]) / 1000 if ahead else math.inf
+            wait = max(0.0, seconds + micros / 1e6 - begun)
+            lines[priority] = Line(length - group["pending"], group["pending"], wait)
+        return lines
+
     def depths(self) -> dict[int, tuple[int, int]]:
         """Entries waiting and entries held by workers, of each priority that has a stream."""
-        depths = {}
-        for priority in PRIORITIES:
-            stream = f"pileus:tasks:{priority}"
-            if self.redis.exists(stream):
-                length = self.redis.xlen(stream)
-                held = cast(dict[str, int], self.redis.xpending(stream, GROUP))["pending"]
-                depths[priority] = (length - held, held)
-        return depths
-
-    def waits(self) -> dict[int, float]:
-        """Seconds that the next task of each priority has waited; 0 where none waits."""
-        waits = {}
-        for priority in PRIORITIES:
-            stream = f"pileus:tasks:{priority}"
-            if self.redis.exists(stream):
-                [group] = cast(list[dict[str, str]], self.redis.xinfo_groups(stream))
-                after = f"({group['last-delivered-id']}"
-                ahead = cast(list[Any], self.redis.xrange(stream, after, "+", 1))
-                begun = int(ahead[0][0].split("-")[0]) / 1000 if ahead else self.now()
-                waits[priority] = max(0.0, self.now() - begun)
-        return waits
-
-    def jobs_by_state(self) -> dict[JobState, int]:
-        """How many jobs there are in each state; those not begun count as running."""
-        held = cast(dict[str, str], self.redis.hgetall("pileus:standing"))
-        found = Counter(told.partition(" ")[0] for told in held.values())
-        return {state: found[state] for state in JobState if state is not JobState.QUEUED}
+        return {priority: (line.waiting, line.held) for priority, line in self.lines().items()}
 
     def forget_dead(self) -> None:
         """Drops workers not seen for a day, so that restarts leave nothing behind."""

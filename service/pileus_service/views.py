@@ -1,7 +1,7 @@
 """What Redis holds of a job and its frames in flight, as a user sees it."""
 
 from collections import Counter
-from typing import Literal
+from typing import Literal, TypedDict
 
 from pileus_service.jobs import FrameView, JobState, JobView
 
@@ -12,25 +12,26 @@ FRAME_STATES: dict[str, Literal["planning", "rendering", "merging"]] = {
 }
 
 
-def frame_view(index: int, held: dict[str, str], in_flight: Counter[int]) -> FrameView | None:
-    if not held:
-        return None
-    total = int(held["total"])
-    samples = int(held["samples"]) + in_flight[index]
-    return FrameView(
-        frame=index,
-        state=FRAME_STATES[held["state"]],
-        tasks=int(held["tasks"]),
-        tasks_done=int(held["done"]),
-        progress=min(1.0, samples / total) if total else 0.0,
-    )
+class Row(TypedDict, total=False):
+    """A job as views.lua tells it; `first_failed` and `reason` are there if any frame failed."""
+
+    held: dict[str, str]
+    failed: int
+    first_failed: int
+    reason: str
+    flight: dict[str, str]
+    active: list[tuple[str, dict[str, str]]]
 
 
-def job_view(
-    job: str, held: dict[str, str], failed: dict[str, str], active: list[FrameView], now: float
-) -> JobView:
-    frames, done = int(held["frames"]), int(held["done"])
-    settled = done + len(failed) + sum(frame.progress for frame in active)
+def job_view(job: str, row: Row, now: float) -> JobView:
+    held, failed = row["held"], row["failed"]
+    in_flight: Counter[int] = Counter()
+    for entry in row["flight"].values():
+        frame, done = entry.split()
+        in_flight[int(frame)] += int(done)
+    active = [_frame_view(int(index), told, in_flight) for index, told in row["active"] if told]
+    frames, frames_done = int(held["frames"]), int(held["done"])
+    settled = frames_done + failed + sum(frame.progress for frame in active)
     state = JobState(held["state"])
     if state is JobState.RUNNING and "started" not in held:
         state = JobState.QUEUED
@@ -39,15 +40,14 @@ def job_view(
     if state is JobState.RUNNING and gained > 0:
         worked = now - (int(held["started"]) + int(held.get("idle", 0))) / 1000
         left = worked * (frames - settled) / gained
-    first = min(failed, key=int) if failed else None
     return JobView(
         id=job,
         name=held["name"],
         state=state,
         priority=int(held["priority"]),
         frames=frames,
-        frames_done=done,
-        frames_failed=len(failed),
+        frames_done=frames_done,
+        frames_failed=failed,
         progress=settled / frames,
         samples=int(held["samples"]),
         tasks=int(held["tasks"]),
@@ -56,6 +56,18 @@ def job_view(
         finished=int(held["finished"]) / 1000 if "finished" in held else None,
         seconds_left=left,
         # By index as all else here; `Farm` puts in the frame's number.
-        reason=f"{first}: {failed[first]}" if first is not None else None,
+        reason=f"{row['first_failed']}: {row['reason']}" if failed else None,
         active=active,
+    )
+
+
+def _frame_view(index: int, held: dict[str, str], in_flight: Counter[int]) -> FrameView:
+    total = int(held["total"])
+    samples = int(held["samples"]) + in_flight[index]
+    return FrameView(
+        frame=index,
+        state=FRAME_STATES[held["state"]],
+        tasks=int(held["tasks"]),
+        tasks_done=int(held["done"]),
+        progress=min(1.0, samples / total) if total else 0.0,
     )
