@@ -79,7 +79,8 @@ class Wish(Record):
 
 
 class Cache(Record):
-    """A cache file as it was when its frame was planned; its path is the shot's."""
+    """A file that a frame reads, a cache or a texture, as it was when the frame was planned; its
+    path is the shot's."""
 
     path: str
     mtime_ns: int
@@ -120,10 +121,16 @@ class Plan(Record):
     frame: int
     identity: str
     cache: Cache
+    textures: list[Cache] = []
     transport: Resolved
     parts: list[Part]
     empty: list[Bucket]
     begun: float
+
+    @property
+    def files(self) -> list[Cache]:
+        """What the frame reads."""
+        return [self.cache, *self.textures]
 
 
 class Done(Record):

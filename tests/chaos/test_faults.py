@@ -239,15 +239,24 @@ def test_caches_in_the_making_are_waited_for_and_only_failed_frames_retried(
         same_bits(cached_shot, farm.data, cut, 2, tmp_path)
 
 
-def test_a_cache_that_changes_while_it_renders_gives_no_frame_of_two_caches(
-    cached_shot: Shot, tmp_path: Path
+@pytest.mark.parametrize("what", ["cache", "texture"])
+def test_a_file_that_changes_while_it_renders_gives_no_frame_of_two(
+    cached_shot: Shot, tmp_path: Path, what: str
 ) -> None:
-    shot = longer(cached_shot, 300)
-    one, other = (tmp_path / "caches" / f"cloud.{n:04d}.vdb" for n in (1, 3))
+    caches = tmp_path / "caches"
+    red, blue = (b"P6 2 1 255 " + 2 * bytes(rgb) for rgb in ((250, 20, 20), (20, 20, 250)))
+    changes, then = {
+        "cache": (caches / "cloud.0001.vdb", (caches / "cloud.0003.vdb").read_bytes()),
+        "texture": (tmp_path / "sky.ppm", blue),
+    }[what]
+    (tmp_path / "sky.ppm").write_bytes(red)
+    sun, dome = cached_shot.lights
+    lights = (sun, dome.model_copy(update={"texture": str(tmp_path / "sky.ppm")}))
+    shot = longer(cached_shot, 300).model_copy(update={"lights": lights})
     with Farm(tmp_path, [tmp_path], 2) as farm:
         job = farm.client.submit(shot).job.id
         until(lambda: len(parts(farm, job)) > 3)
-        one.write_bytes(other.read_bytes())
+        changes.write_bytes(then)
         assert ended(farm, job).state == "done"
         same_bits(shot, farm.data, job, 1, tmp_path)
 

@@ -259,12 +259,13 @@ def test_a_task_whose_files_are_swapped_after_its_check_reads_and_writes_none_ou
     """The whole way of a frame: cache, texture and image, each made to lead outwards in turn."""
     cache = tmp_path / "caches" / "cloud.0001.vdb"
     core.make_cloud(str(cache), frame=1, frames=1, resolution=16)
-    shutil.copy2(cache, outside)  # the same to the nanosecond: none but its place gives it away
-    for folder in (tmp_path / "sky", outside):
-        folder.mkdir(exist_ok=True)
-        (folder / "sky.ppm").write_bytes(b"P6 2 1 255 " + bytes(range(6)))
+    (tmp_path / "sky").mkdir()
+    texture = tmp_path / "sky" / "sky.ppm"
+    texture.write_bytes(b"P6 2 1 255 " + bytes(range(6)))
+    for file in (cache, texture):
+        shutil.copy2(file, outside)  # the same to the nanosecond: none but its place gives it away
     (tmp_path / "out").mkdir()
-    shot["lights"][1]["texture"] = str(tmp_path / "sky" / "sky.ppm")
+    shot["lights"][1]["texture"] = str(texture)
     roots = Roots([tmp_path / name for name in ("caches", "sky", "out")])
     farm = Farm(Store(tmp_path / "data"), Queue(farm.queue.redis), roots)
     view, _ = farm.submit(Shot.model_validate(shot), 5, None)

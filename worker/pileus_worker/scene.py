@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
@@ -30,14 +30,22 @@ def cache_path(shot: Shot, frame: int) -> Path:
     return Path(expand(shot.volumes[0].cache, frame))
 
 
+def files_of(shot: Shot, frame: int, paths: PathMap = NOWHERE_ELSE) -> list[Cache]:
+    """What a frame reads as it is on disk now: its cache, then the textures of its lights."""
+    return [_on_disk(field, path, paths) for field, path in shot.inputs(frame)]
+
+
 def cache_of(shot: Shot, frame: int, paths: PathMap = NOWHERE_ELSE) -> Cache:
     """The cache file of a frame as it is on disk now."""
-    path = cache_path(shot, frame)
+    return _on_disk("volumes.0.cache", cache_path(shot, frame), paths)
+
+
+def _on_disk(field: str, path: Path, paths: PathMap) -> Cache:
     here = paths.here(str(path))
     try:
         found = Path(here).stat()
     except OSError as error:
-        raise core.InputError(f"volumes.0.cache: {here}: {error.strerror}; mend the path") from None
+        raise core.InputError(f"{field}: {here}: {error.strerror}; mend the path") from None
     return Cache(path=str(path), mtime_ns=found.st_mtime_ns, size=found.st_size)
 
 
@@ -91,11 +99,11 @@ def make_transport(shot: Shot, resolved: Resolved) -> core.Transport:
     )
 
 
-def identity(shot: Shot, frame: int, cache: Cache) -> str:
+def identity(shot: Shot, frame: int, files: Sequence[Cache]) -> str:
     """A digest of all that a frame's pixels depend on; partials of another are no part of it."""
     pixels = {
         "frame": frame,
-        "cache": cache.model_dump(),
+        "files": [file.model_dump() for file in files],
         "camera": shot.camera.at(frame).model_dump(),
         "image": shot.image.model_dump(exclude={"output", "pixel_type", "denoise"}),
         "version": core.__version__,

@@ -78,7 +78,7 @@ class Work:
             plan = files.plan()
             if plan is None:
                 return Stale(stale=f"frame {self.frame}: its plan is gone from the data folder")
-            if plan.identity != scene.identity(self.job.shot, self.frame, plan.cache):
+            if plan.identity != scene.identity(self.job.shot, self.frame, plan.files):
                 return Replan()
             if self.kind is Kind.RENDER:
                 return self._render(files, plan)
@@ -98,17 +98,17 @@ class Work:
         check_installed(self.job.shot, self.job.shot.name)
         if self.job.wait_for_caches and (trouble := self._unready(files)):
             return Waiting(wait=trouble)
-        cache = scene.cache_of(self.job.shot, self.frame, self.paths)
-        identity = scene.identity(self.job.shot, self.frame, cache)
+        read = scene.files_of(self.job.shot, self.frame, self.paths)
+        identity = scene.identity(self.job.shot, self.frame, read)
         plan = files.plan()
         if plan is not None and plan.identity != identity:
             files.drop_plan()
             plan = None
         if plan is None:
             try:
-                plan = files.keep_plan(self._new_plan(cache, identity))
+                plan = files.keep_plan(self._new_plan(read, identity))
             except core.InputError as error:
-                if self.job.wait_for_caches and not _settled(cache):
+                if self.job.wait_for_caches and not _settled(read[0]):
                     return Waiting(wait=str(error))
                 raise
         finished = [i for i, part in enumerate(plan.parts) if files.part(part).exists()]
@@ -130,10 +130,11 @@ class Work:
         files.mark_seen(cache)
         return f"volumes.0.cache: {path} may still be in the making"
 
-    def _new_plan(self, cache: Cache, identity: str) -> Plan:
+    def _new_plan(self, read: list[Cache], identity: str) -> Plan:
         begun = time.time()
         shot = self.job.shot
-        view = self._scene(cache)
+        view = self._scene(read)
+        cache, *textures = read
         size = (shot.image.width, shot.image.height)
         samples = shot.sampling.samples
         with self._phase("plan"):
@@ -155,6 +156,7 @@ class Work:
             frame=self.frame,
             identity=identity,
             cache=cache,
+            textures=textures,
             transport=resolved,
             parts=parts,
             empty=empty,
@@ -192,7 +194,7 @@ class Work:
         part = plan.parts[self.part]
         path = files.part(part)
         if not self._whole(files, part, plan):
-            view = self._scene(plan.cache)
+            view = self._scene(plan.files)
             if self.read_ahead:
                 self._begin_next()
             # Only where the frame's folder is: a job that was removed leaves nothing behind.
@@ -236,7 +238,7 @@ class Work:
 
     def _empty_buckets(self, plan: Plan) -> Iterator[core.Partial]:
         if plan.empty:
-            view = self._scene(plan.cache)
+            view = self._scene(plan.files)
             for bucket in plan.empty:
                 yield self._samples(view, plan, bucket, (0, self.job.shot.sampling.samples))
 
@@ -281,21 +283,23 @@ class Work:
         files.drop_parts()
         shutil.rmtree(self._staging, ignore_errors=True)
 
-    def _scene(self, cache: Cache) -> core.Scene:
-        """The scene with the volume as it was planned: asked before and after it is read, so that
-        no frame is of two caches."""
+    def _scene(self, read: list[Cache]) -> core.Scene:
+        """The scene of its files as they were planned: asked before and after they are read, so
+        that no frame is of two caches or textures."""
+        shot = self.job.shot
         try:
-            self._same(cache)
+            self._same(read)
             with self._phase("load"):
-                volume = self.caches.get(cache, self.job.shot.volumes[0].density)
+                volume = self.caches.get(read[0], shot.volumes[0].density)
+                here = self.paths.shot(shot)
+                return scene.make_scene(here, self.frame, volume, self.roots.reading)
         finally:
-            self._same(cache)
-        shot = self.paths.shot(self.job.shot)
-        return scene.make_scene(shot, self.frame, volume, self.roots.reading)
+            self._same(read)
 
-    def _same(self, cache: Cache) -> None:
-        if scene.cache_of(self.job.shot, self.frame, self.paths) != cache:
-            raise StaleError(f"{cache.path}: changes while its frame is rendered")
+    def _same(self, read: list[Cache]) -> None:
+        now = scene.files_of(self.job.shot, self.frame, self.paths)
+        for file in set(read) - set(now):
+            raise StaleError(f"{file.path}: changes while its frame is rendered")
 
     def _whole(self, files: FrameStore, part: Part, plan: Plan) -> bool:
         """Whether a partial is there already, from an attempt whose completion was not heard."""
