@@ -54,6 +54,23 @@ def test_render_writes_each_frame_and_reports_it(shot_file: Path, tmp_path: Path
     assert channels["R"].shape == (32, 48)
 
 
+def test_a_render_does_not_wait_for_what_other_commands_need(shot_file: Path) -> None:
+    program = """
+import sys
+from pileus_service.cli import app
+try:
+    app()
+except SystemExit as ended:
+    assert not ended.code
+print(*sys.modules)
+"""
+    command = [sys.executable, "-c", program, "render", str(shot_file), "--frames", "1"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    loaded = {*ended.stdout.split()}
+    assert "pileus_worker.deciding" in loaded
+    assert not loaded & {"fastapi", "httpx", "redis", "rich", "structlog", "tenacity", "PIL"}
+
+
 def test_wrong_input_of_render_is_one_line_and_exit_code_two(
     shot_file: Path, tmp_path: Path
 ) -> None:

@@ -12,6 +12,13 @@ Sets = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")]
 
+Server = Annotated[
+    str, typer.Option(envvar="PILEUS_SERVER", help="The service's address.", metavar="URL")
+]
+Token = Annotated[
+    str | None, typer.Option(envvar="PILEUS_TOKEN", help="The service's token.", metavar="TOKEN")
+]
+
 Data = Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")]
 DATA = Path("pileus-data")
 Redis = Annotated[str, typer.Option(envvar="PILEUS_REDIS", help="Redis's address.")]

@@ -3,10 +3,10 @@
 import sys
 import time
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 LINE_EVERY = 5.0
 
@@ -34,19 +34,7 @@ class Display:
     """Shows rows; the first is the whole, the others come and go."""
 
     def __init__(self) -> None:
-        console = Console(stderr=True)
-        self._bars = (
-            Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TaskProgressColumn(),
-                TextColumn("{task.fields[detail]}"),
-                console=console,
-                transient=True,
-            )
-            if console.is_terminal
-            else None
-        )
+        self._bars = _bars() if sys.stderr.isatty() else None
         self._tasks: dict[str, TaskID] = {}
         self._said = ""
         self._said_at = 0.0
@@ -89,3 +77,17 @@ class Display:
         if line != self._said and now - self._said_at >= LINE_EVERY:
             self._said, self._said_at = line, now
             print(line, file=sys.stderr, flush=True)
+
+
+def _bars() -> "Progress":
+    from rich.console import Console  # a pipe need not wait for it
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[detail]}"),
+        console=Console(stderr=True),
+        transient=True,
+    )

@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 
 from pileus_service.app import create_app
 from pileus_service.auth import FAILURES_A_MINUTE, Guard, Role, Tokens, guard_for
+from pileus_service.commands.token import app as token_app
 from pileus_service.errors import InputError
 from pileus_service.farm import Farm
 from pileus_service.pages import PAGES
-from pileus_service.tokens import app as tokens_app
 from pileus_worker.private_redis import PrivateRedis
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
@@ -244,7 +244,7 @@ def test_many_submissions_at_once_with_one_key_make_one_job(
 
 
 def token_command(data: Path, *arguments: str) -> str:
-    ended = CliRunner().invoke(tokens_app, [*arguments, "--data", str(data)])
+    ended = CliRunner().invoke(token_app, [*arguments, "--data", str(data)])
     assert ended.exit_code == 0, ended.output
     return ended.stdout.strip()
 

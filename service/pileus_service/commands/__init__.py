@@ -1,0 +1,1 @@
+"""The commands that need no renderer, each loaded when it is asked for."""
