@@ -142,6 +142,25 @@ Scene make_scene(std::shared_ptr<const Volume> volume, double extinction, const 
     return {std::move(volume), medium, camera, std::move(bare), width, height, background};
 }
 
+/// Raises wrong input in Python. What a file put into the message and Python would not print, as a
+/// mark that turns the line around, is shown escaped.
+void raise_input_error(const std::exception_ptr& thrown, void* type) {
+    try {
+        std::rethrow_exception(thrown);
+    } catch (const InputError& error) {
+        const std::string_view what = error.what();
+        const auto length = static_cast<Py_ssize_t>(what.size());
+        const auto text = nb::steal(PyUnicode_DecodeUTF8(what.data(), length, "backslashreplace"));
+        nb::list shown;
+        for (const nb::handle letter : text) {
+            const bool prints = nb::cast<bool>(letter.attr("isprintable")());
+            shown.append(prints ? nb::borrow(letter)
+                                : letter.attr("encode")("unicode_escape").attr("decode")());
+        }
+        PyErr_SetObject(static_cast<PyObject*>(type), nb::str("").attr("join")(shown).ptr());
+    }
+}
+
 }  // namespace
 
 NB_MODULE(_core, m) {
@@ -149,7 +168,8 @@ NB_MODULE(_core, m) {
     m.attr("__version__") = PILEUS_VERSION;
     m.attr("METHODS") = method_names();
 
-    nb::exception<InputError>(m, "InputError", PyExc_ValueError);
+    const nb::exception<InputError> input_error(m, "InputError", PyExc_ValueError);
+    nb::register_exception_translator(raise_input_error, input_error.ptr());
     nb::exception<Cancelled>(m, "Cancelled", PyExc_Exception);
 
     nb::class_<Volume>(m, "Volume", "A density field read from an OpenVDB file; immutable.")

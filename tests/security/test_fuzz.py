@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pileus_core as core
 import pytest
 
 from hostile import Reader, hostile_files, mutated, seeds
@@ -51,6 +52,17 @@ def test_ten_thousand_mutants(
     reader: Reader, tmp_path: Path, suffix: str, count: int, seed: int
 ) -> None:
     look_through(reader, tmp_path, suffix, count, seed)
+
+
+def test_what_python_would_not_print_is_shown_escaped_in_an_error(tmp_path: Path) -> None:
+    """A mark that turns the line around, an end of the line."""
+    file = tmp_path / "a\u202eb\nd\u00e9j\u00e0.vdb"
+    file.write_bytes(b"no vdb")
+    with pytest.raises(core.InputError) as refused:
+        core.Volume(str(file))
+    assert str(refused.value).startswith(
+        f"{tmp_path}/a\\u202eb\\nd\u00e9j\u00e0.vdb: cannot be read"
+    )
 
 
 @pytest.mark.parametrize("frames", [8, pytest.param(60, marks=pytest.mark.slow)])

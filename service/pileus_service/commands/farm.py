@@ -11,7 +11,7 @@ from rich.console import Console
 
 from pileus_service import terminal
 from pileus_service.client import Client
-from pileus_service.errors import FarmError
+from pileus_service.errors import FarmError, printable
 from pileus_service.jobs import JobState
 from pileus_service.options import LISTEN, AsJson, Frames, Server, Sets, ShotFile, Token
 from pileus_service.shotfile import load_shot
@@ -111,7 +111,7 @@ def frame_log(
         told += [line.reason] if line.reason else []
         print("  ".join(told))
         for text in (line.output or "").splitlines():
-            print(f"    {text}")
+            print(f"    {printable(text)}")
 
 
 def _verb(verb: Literal["cancel", "pause", "resume", "retry"], text: str) -> None:
