@@ -63,6 +63,14 @@ class FrameStore:
     def part(self, part: Part) -> Path:
         return self.folder / "parts" / part.name
 
+    def parts(self) -> set[str]:
+        """The names of the partials that are there: one look, where a look for each would be ten
+        thousand questions to a file server."""
+        try:
+            return {path.name for path in (self.folder / "parts").iterdir()}
+        except FileNotFoundError:
+            return set()
+
     def look_again(self) -> None:
         """Has an NFS client ask which names there are: it may remember one as absent that another
         host has made since, and asks anew when a folder is opened (close-to-open consistency)."""

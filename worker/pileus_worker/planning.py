@@ -75,25 +75,22 @@ def cut(
     scene: core.Scene, cost: Cost, size: tuple[int, int], samples: int, seconds: float
 ) -> tuple[list[Part], list[Bucket]]:
     """Parts of about so many seconds each, and the buckets that no ray of meets the volume."""
-    width, height = size
     edge = LARGEST
     while True:
-        buckets = tiles(width, height, edge)
-        dearest = max(_seconds(bucket, cost) for bucket in buckets) * samples
+        costs = {bucket: _seconds(bucket, cost) * samples for bucket in tiles(*size, edge)}
         # Large buckets and many ranges, but none of so few samples that its image is mostly noise.
-        if edge == SMALLEST or dearest / seconds <= max(1, samples // 4):
+        if edge == SMALLEST or max(costs.values()) / seconds <= max(1, samples // 4):
             break
         edge //= 2
-    touched = [bucket for bucket in buckets if scene.touches(bucket)]
-    total = sum(_seconds(bucket, cost) for bucket in touched) * samples
-    task = max(seconds, total / MAX_TASKS)
+    touched = [bucket for bucket in costs if scene.touches(bucket)]
+    task = max(seconds, sum(costs[bucket] for bucket in touched) / MAX_TASKS)
     parts = []
     for bucket in touched:
-        count = min(samples, max(1, round(_seconds(bucket, cost) * samples / task)))
+        count = min(samples, max(1, round(costs[bucket] / task)))
         bounds = [samples * i // count for i in range(count + 1)]
         parts += [Part(bucket=bucket, samples=(bounds[i], bounds[i + 1])) for i in range(count)]
     touched_set = set(touched)
-    return parts, [bucket for bucket in buckets if bucket not in touched_set]
+    return parts, [bucket for bucket in costs if bucket not in touched_set]
 
 
 def even(scene: core.Scene, size: tuple[int, int], samples: int) -> tuple[list[Part], list[Bucket]]:

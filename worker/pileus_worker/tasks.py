@@ -111,7 +111,8 @@ class Work:
                 if self.job.wait_for_caches and not _settled(read[0]):
                     return Waiting(wait=str(error))
                 raise
-        finished = [i for i, part in enumerate(plan.parts) if files.part(part).exists()]
+        there = files.parts()
+        finished = [i for i, part in enumerate(plan.parts) if part.name in there]
         return Planned(
             tasks=len(plan.parts),
             finished=finished,
