@@ -171,6 +171,7 @@ class Life:
         self._saying = threading.Lock()
         self._permitted = threading.Event()
         self._denied = False
+        self._told_bytes = 0
 
     def live(self) -> None:
         while True:
@@ -212,11 +213,12 @@ class Life:
         )
 
     def _do(self, work: "Work") -> None:
-        cpu, read = time.process_time(), self._caches.bytes_read
+        cpu = time.process_time()
 
         def spent() -> Spent:
-            taken = self._caches.bytes_read - read
-            return Spent(time.process_time() - cpu, taken, work.phases)
+            # What was read ahead between two tasks counts for the later one.
+            told, self._told_bytes = self._told_bytes, self._caches.bytes_read
+            return Spent(time.process_time() - cpu, self._told_bytes - told, work.phases)
 
         outcome = _outcome(work, spent)
         self._work = None
