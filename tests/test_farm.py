@@ -190,8 +190,9 @@ def test_a_lost_redis_loses_nothing_and_renders_nothing_twice(
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
+@pytest.mark.parametrize("damage", ["flipped", "truncated"])
 def test_a_damaged_partial_is_rendered_again(
-    client: Client, long_shot: Shot, tmp_path: Path
+    client: Client, long_shot: Shot, tmp_path: Path, damage: str
 ) -> None:
     job = client.submit(long_shot).job.id
     parts = tmp_path / "farm" / "jobs" / job / "frames" / "000001" / "parts"
@@ -202,7 +203,7 @@ def test_a_damaged_partial_is_rendered_again(
     client.control(job, "pause")
     data = bytearray(files[0].read_bytes())
     data[len(data) // 2] ^= 0x10
-    files[0].write_bytes(data)
+    files[0].write_bytes(data if damage == "flipped" else data[: len(data) // 2])
     client.control(job, "resume")
     finish(client, job)
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)

@@ -19,16 +19,28 @@ import pytest
 import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from prometheus_client.parser import text_string_to_metric_families
 from rich.console import Console
 
 from pileus_service import framelog, logs, terminal
 from pileus_service.client import Client
-from pileus_service.jobs import FrameMap, Job, JobState, JobView, Wish
+from pileus_service.jobs import (
+    Doing,
+    FrameMap,
+    FrameView,
+    Job,
+    JobState,
+    JobView,
+    Kind,
+    Wish,
+    WorkerView,
+)
 from pileus_service.shot import Shot
 from pileus_service.store import Store
 from pileus_worker.embedded import EmbeddedFarm, Workers, embedded_farm
 from pileus_worker.logfile import LOG_BYTES
 from pileus_worker.private_redis import PrivateRedis
+from serial_render import plan_of
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
 
@@ -84,6 +96,52 @@ def test_a_crashed_attempt_is_told_in_its_frames_log_and_counted(
     assert 'pileus_attempts_total{kind="plan",outcome="done"} 1.0' in metrics
 
 
+def test_the_metrics_add_up_to_what_was_done(
+    farm: EmbeddedFarm, shot: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "caches").mkdir()
+    caches = [tmp_path / "caches" / f"cloud.{frame:04d}.vdb" for frame in (1, 2, 3)]
+    for frame, path in enumerate(caches, 1):
+        core.make_cloud(str(path), frame=frame, frames=3, resolution=48)
+    with Client(farm.url) as client:
+        *_, job = client.watch(client.submit(Shot.model_validate(shot), priority=3).job.id)
+        assert job.state == "done"
+
+        def metric(name: str, **labels: str) -> float:
+            told = httpx.get(f"{farm.url}/metrics").text
+            return sum(
+                sample.value
+                for family in text_string_to_metric_families(told)
+                for sample in family.samples
+                if sample.name == f"pileus_{name}" and labels.items() <= sample.labels.items()
+            )
+
+        plans = [plan_of(tmp_path / "farm", job.id, frame) for frame in (1, 2, 3)]
+        lines = [line for frame in (1, 2, 3) for line in client.log(job.id, frame)]
+    parts = [part for plan in plans for part in plan.parts]
+    assert metric("frames_done_total") == 3
+    assert metric("samples_total") == sum(part.pixel_samples for part in parts)
+    assert metric("tasks_done_total") == len(parts) + 6
+    for kind, count in (("plan", 3), ("render", len(parts)), ("merge", 3)):
+        assert metric("attempts_total", kind=kind, outcome="done") == count
+    assert metric("attempts_total") == len(parts) + 6
+    assert metric("attempt_failures_total") == 0
+    # One worker reads each cache once, and the next one ahead.
+    assert metric("cache_read_bytes_total") == sum(path.stat().st_size for path in caches)
+    # The seconds by phase are those of the attempts, told as each ends to the millisecond.
+    seconds = sum(line.seconds for line in lines if line.seconds is not None)
+    assert metric("phase_seconds_total") == pytest.approx(seconds, abs=0.001 * (len(parts) + 6))
+    assert all(
+        metric("phase_seconds_total", phase=each) > 0 for each in ("render", "merge", "write")
+    )
+    core_seconds = metric("threads") * metric("phase_seconds_total")
+    assert metric("core_seconds_total") == pytest.approx(core_seconds, rel=1e-3)
+    assert metric("cpu_seconds_total") > 0
+    assert (metric("tasks_waiting", priority="3"), metric("tasks_held", priority="3")) == (0, 0)
+    assert metric("queue_age_seconds", priority="3") == 0
+    assert (metric("workers"), metric("workers_busy"), metric("threads_busy")) == (1, 0, 0)
+
+
 def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame: Shot) -> None:
     store = Store(tmp_path / "data")
     store.create(Job(id="j", created=0, shot=one_frame), Wish())
@@ -135,6 +193,31 @@ def test_the_grid_has_a_mark_for_every_frame_in_its_place(states: str) -> None:
     assert [int(first) for first, _ in rows] == list(range(10, 10 + len(states), terminal.ROW))
     marks = "".join(marks for _, marks in rows).replace(" ", "")
     assert marks == states.translate(str.maketrans("prmdfc.", "○◐◕●✗-·"))
+
+
+def test_a_running_job_shows_its_buckets_its_workers_and_the_time_left() -> None:
+    doing = Doing(job="j", frame=7, kind=Kind.RENDER, bucket=(0, 32, 64, 96), samples=(8, 16),
+                  progress=0.5)  # fmt: skip
+    seen = {"host": "h", "pid": 1, "threads": 4, "started": 0.0, "seen": 0.0, "alive": True}
+    here = WorkerView(name="cirrus", doing=doing, **seen)
+    elsewhere = WorkerView(name="nimbus", doing=doing.model_copy(update={"job": "k"}), **seen)
+    active = FrameView(frame=7, state="rendering", tasks=9, tasks_done=4, progress=0.5)
+    job = JobView(
+        id="j", name="n", state=JobState.RUNNING, priority=5, frames=1, frames_done=0,
+        frames_failed=0, progress=0.5, samples=0, tasks=0, created=0.0, seconds_left=3780,
+        active=[active],
+    )  # fmt: skip
+    frame_map = FrameMap(frames="7", states="r", width=64, height=96)
+    page = io.StringIO()
+    picture = terminal.job_picture(job, frame_map, [], [here, elsewhere])
+    Console(file=page, width=140).print(picture)
+    told = page.getvalue()
+    assert "1 h 03 min left" in told
+    assert re.search(r"7 +rendering .* 4 of 9", told)
+    assert re.search(
+        r"cirrus +● at work +4 +render frame 7, pixels 0,32 to 64,96, samples 8 to 16", told
+    )
+    assert "nimbus" not in told
 
 
 def test_every_line_says_what_it_is_about(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from pydantic import SecretStr
 from redis import Redis
 from standardwebhooks import Webhook
 
+from pileus_service import webhooks
 from pileus_service.app import create_app
 from pileus_service.auth import Guard
 from pileus_service.errors import InputError
@@ -22,7 +23,7 @@ from pileus_service.farm import Farm
 from pileus_service.queue import Queue
 from pileus_service.roots import Roots
 from pileus_service.store import Store
-from pileus_service.webhooks import HookSettings, Webhooks
+from pileus_service.webhooks import HookSettings, Notice, Webhooks
 
 SECRET = "whsec_C2FVsBQIhrscChlQIMV+b5sSYspob7oD"
 
@@ -34,6 +35,9 @@ class Listener(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Ear)
         self.answers = list(answers)
         self.heard: list[tuple[str, dict[str, str], bytes]] = []
+        self.pause = 0.0
+        self.now = self.most = 0  # that it is told at once
+        self.counting = threading.Lock()
         self.url = f"http://127.0.0.1:{self.server_address[1]}"
 
 
@@ -42,6 +46,12 @@ class Ear(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["Content-Length"]))
+        with self.server.counting:
+            self.server.now += 1
+            self.server.most = max(self.server.most, self.server.now)
+        time.sleep(self.server.pause)
+        with self.server.counting:
+            self.server.now -= 1
         self.server.heard.append((self.path, dict(self.headers), body))
         self.send_response(self.server.answers.pop(0) if self.server.answers else 204)
         self.send_header("Location", f"{self.server.url}/elsewhere")
@@ -123,6 +133,30 @@ def test_a_restart_loses_no_notice(redis: Redis, tmp_path: Path, shot: dict[str,
         with service(redis, tmp_path, allow=ear.url):
             until(ear.heard, 1)
         assert Webhook(SECRET).verify(ear.heard[0][2], ear.heard[0][1])["data"]["id"] == job
+
+
+@pytest.mark.usefixtures("caches")
+def test_notices_are_bounded_in_number_at_once_and_in_time(
+    redis: Redis, tmp_path: Path, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhooks, "MOST_KEPT", 30)
+    with listening() as ear:
+        ear.pause = 0.2
+        asleep = service(redis, tmp_path, urls=f"{ear.url}/hook")
+        for _ in range(31):
+            asleep.post(f"/v1/jobs/{send(asleep, shot)}/cancel")
+        kept = sorted((tmp_path / "data" / "outbox").iterdir())
+        assert len(kept) == 30, "one more than may wait is dropped"
+        old = Notice.model_validate_json(kept[0].read_bytes())
+        aged = old.model_copy(update={"created": time.time() - webhooks.LIFETIME})
+        kept[0].write_text(aged.model_copy(update={"url": "http://127.0.0.1:9/"}).model_dump_json())
+        with service(redis, tmp_path, urls=f"{ear.url}/hook"):
+            until(ear.heard, 29)
+            end = time.monotonic() + 60
+            while any((tmp_path / "data" / "outbox").iterdir()):
+                assert time.monotonic() < end, "what is too old is given up"
+                time.sleep(0.05)
+        assert 1 < ear.most <= webhooks.AT_ONCE
 
 
 @pytest.mark.usefixtures("caches")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
+from pileus_service import doctor
 from pileus_service.jobs import Kind, Planned, Rendered, Wish, WorkerInfo
 from pileus_service.queue import Queue, connect
 from pileus_worker.private_redis import PrivateRedis
@@ -79,3 +80,12 @@ def test_a_clock_set_forward_takes_tasks_from_the_living_and_no_result(
     merge = queue.claim(A)
     assert merge is not None
     assert merge.kind is Kind.MERGE
+
+
+@pytest.mark.parametrize(
+    ("offset", "found"), [(3600, "behind Redis's"), (-3600, "ahead of Redis's")]
+)
+def test_the_doctor_finds_clocks_that_differ(clock: Clock, offset: float, found: str) -> None:
+    clock.jump(offset)
+    [told] = [each for each in doctor.redis_server(clock.redis) if each.what == "clock"]
+    assert (told.level, found in told.found, bool(told.mend)) == ("warning", True, True)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
@@ -15,7 +16,7 @@ import pytest
 
 from chaos.farm import Farm, frozen, until
 from chaos.run import chaos
-from pileus_service.jobs import JobView
+from pileus_service.jobs import TERMINAL, JobView
 from pileus_service.shot import Shot
 from serial_render import same_bits
 
@@ -65,6 +66,7 @@ def test_frames_are_right_whatever_is_killed(size: dict[str, int], tmp_path: Pat
     figures = chaos(tmp_path, seed=1, **size)
     print(figures)
     assert figures["left_over"] == []
+    assert figures["kills"]
 
 
 @pytest.mark.slow
@@ -125,13 +127,39 @@ def test_a_redis_of_an_earlier_hour_is_put_right(cached_shot: Shot, tmp_path: Pa
         same_bits(longer(cached_shot, 300), farm.data, late, 1, tmp_path)
 
 
-def test_a_killed_service_is_back_within_five_seconds(cached_shot: Shot, tmp_path: Path) -> None:
-    with Farm(tmp_path, [tmp_path], 1) as farm:
-        job = farm.client.submit(longer(cached_shot, 200)).job.id
-        os.kill(farm.service.pid, signal.SIGKILL)
-        until(lambda: farm.service.process.poll() is None)
+def test_a_killed_service_is_back_and_whoever_watches_goes_on(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    heard: list[JobView] = []
+    connections = 0
+
+    def listen(address: str) -> None:
+        """As a browser does: where a stream breaks off, it asks for it again."""
+        nonlocal connections
+        while not heard or heard[-1].state not in TERMINAL:
+            with contextlib.suppress(httpx.TransportError), httpx.stream("GET", address) as answer:
+                connections += 1
+                for line in answer.iter_lines():
+                    if line.startswith("data:"):
+                        heard.append(JobView.model_validate_json(line[5:]))
+            time.sleep(0.05)
+
+    with Farm(tmp_path, [tmp_path], 1) as farm, ThreadPoolExecutor(1) as crowd:
+        job = farm.client.submit(longer(cached_shot, 400)).job.id
+        watch = farm.client.watch(job)
+        ear = crowd.submit(listen, f"http://{farm.listen}/v1/jobs/{job}/events")
+        until(lambda: any(view.samples for view in heard))
+        next(watch)
+        killed = farm.service.process
+        killed.kill()
+        killed.wait()
         print(f"the service was away for {farm.until_served():.1f} s")
-        assert ended(farm, job).state == "done"
+        *_, last = watch
+        ear.result(120)
+    assert last.state == heard[-1].state == "done"
+    assert connections >= 2
+    rendered = [view.samples for view in heard]
+    assert rendered == sorted(rendered), "progress goes on from where it was"
 
 
 @contextlib.contextmanager
@@ -283,5 +311,8 @@ def test_a_cache_that_ruins_its_reader_costs_its_frame_and_no_worker(
         assert (view.state, view.frames_done, view.frames_failed) == ("failed", 2, 1)
         [told] = [frame.reason or "" for frame in farm.client.frames(job) if frame.frame == 2]
         assert len(re.findall(reason, told)) == 3, "each of three workers tried"
+        failed = [line for line in farm.client.log(job, 2) if line.event == "failed"]
+        assert {line.worker for line in failed} == {w.name for w in farm.queue.workers()}
+        assert all(re.search(reason, line.reason or "") for line in failed)
         assert pids == {part.pid for part in farm.workers}
         assert all(worker.aside is None for worker in farm.queue.workers())

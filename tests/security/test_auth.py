@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 import socket
 import subprocess
@@ -111,6 +112,24 @@ def test_wrong_revoked_mangled_and_foreign_tokens_are_refused(
     assert far.get(path, headers=bearer(again)).status_code == 200
     (tmp_path / "data" / "tokens" / "reader.json").write_text("{")
     assert far.get(path, headers=bearer(again)).status_code == 401
+
+
+def test_a_comparison_in_constant_time_alone_decides(
+    far: TestClient, tokens: Tokens, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a name that there is not, too: no time tells which names there are."""
+    good = tokens.create("reader", Role.READ)
+    compared: list[tuple[str, str]] = []
+
+    def never(one: str, other: str) -> bool:
+        compared.append((one, other))
+        return False
+
+    monkeypatch.setattr("hmac.compare_digest", never)
+    for token in (good, "reader.guess", "nobody.guess"):
+        assert far.get("/v1/jobs", headers=bearer(token)).status_code == 401
+    assert len(compared) == 3
+    assert {len(each) for pair in compared for each in pair} == {64}
 
 
 def test_only_the_hash_is_kept_in_a_folder_of_ones_own(tokens: Tokens, tmp_path: Path) -> None:
@@ -326,3 +345,22 @@ def test_a_real_service_takes_tokens_as_they_come_and_logs_none(
     for file in [log, *(path for path in data.rglob("*") if path.is_file())]:
         text = file.read_text()
         assert not [secret for secret in (*secrets, "redispassword") if secret in text], file
+
+
+def test_a_worker_that_redis_refuses_logs_no_password(
+    tmp_path: Path, private_redis: PrivateRedis
+) -> None:
+    guarded = private_redis.url.replace("unix://", "unix://nobody:redispassword@")
+    command = [PILEUS, "worker", "--data", str(tmp_path / "data"), "--root", str(tmp_path)]
+    log = tmp_path / "log"
+    with log.open("w") as out:
+        env = {**os.environ, "PILEUS_REDIS": guarded}
+        process = subprocess.Popen(command, stdout=out, stderr=out, env=env)
+    try:
+        for attempt in Retrying(stop=stop_after_delay(30), wait=wait_fixed(0.1)):
+            with attempt:
+                assert "no tasks to be had" in log.read_text()
+    finally:
+        process.terminate()
+        process.wait(20)
+    assert "redispassword" not in log.read_text()
