@@ -1,5 +1,7 @@
 #include "schedule.h"
 
+#include <ranges>
+
 namespace pileus {
 
 Schedule::Schedule(const Medium& medium) : media_{medium}, order_{0.0f} {}
@@ -24,16 +26,19 @@ Schedule::Schedule(const Medium& medium, int from) : media_{medium}, order_{0.0f
     pace_ = (1.0f - media_.back().phase().g()) / (1.0f - g);
 }
 
-int Schedule::order(int n) const {
+int Schedule::order(int n) const { return static_cast<int>(exact_order(n)); }
+
+float Schedule::exact_order(int n) const {
     const auto last = static_cast<int>(order_.size()) - 1;
-    return static_cast<int>(n <= last ? order_[static_cast<std::size_t>(n)]
-                                      : order_.back() + pace_ * static_cast<float>(n - last));
+    return n <= last ? order_[static_cast<std::size_t>(n)]
+                     : order_.back() + pace_ * static_cast<float>(n - last);
 }
 
+// Searched for, not counted: a path may have a million events.
 int Schedule::events(int orders) const {
-    int n = 1;
-    while (n < orders && order(n) < orders) ++n;
-    return n;
+    const std::ranges::iota_view events(1, std::max(1, orders));
+    const auto below = [&](int n) { return exact_order(n) < static_cast<float>(orders); };
+    return *std::ranges::partition_point(events, below);
 }
 
 }  // namespace pileus

@@ -38,6 +38,8 @@ class Schedule {
     int events(int orders) const;
 
   private:
+    float exact_order(int n) const;
+
     std::size_t index(int n) const {
         return std::min(static_cast<std::size_t>(n), media_.size() - 1);
     }

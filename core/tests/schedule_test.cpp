@@ -48,6 +48,11 @@ TEST(Schedule, KeepsAbsorptionAndReducedScattering) {
         // Far out each event stands for 1 / (1 - g).
         EXPECT_NEAR(schedule.order(1040) - schedule.order(40), 1000.0f / (1.0f - g),
                     1.0f + 1.0f / (1.0f - g));
+        for (const int bound : {1, 2, 5, 300, 1 << 20}) {
+            const int events = schedule.events(bound);
+            EXPECT_LT(schedule.order(events - 1), bound);
+            EXPECT_GE(schedule.order(events), bound);
+        }
     }
 }
 
