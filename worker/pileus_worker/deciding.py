@@ -7,7 +7,7 @@ so every machine decides alike.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,8 @@ BLOCK = 4
 SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
-Channels = dict[str, NDArray[np.float32]]
+Planes = NDArray[np.float32]
+_ORDERS = [f"order{order:02d}." for order in range(PILOT_ORDERS)]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
 
@@ -37,10 +38,12 @@ HYSTERESIS = 1.25
 @dataclass(frozen=True)
 class Measure:
     """What a pilot tells: the RMS relative error of leaving out the orders from N on, N = 0 .. 32
-    (33 values, falling), of the look where it is greatest; and the frame's mean opacity."""
+    (33 values, falling), of the look where it is greatest; the frame's mean opacity; and its noise
+    with one sample a pixel."""
 
     tail: NDArray[np.float64]
     opacity: float = 1.0
+    noise: float = math.inf
 
 
 def render(
@@ -175,32 +178,32 @@ class Pilot:
         # Of the frame's samples a pixel, for each of two halves, whole and by order.
         self._share = PILOT_SHARE * pixels / (4 * width * height)
         self._scene = scene.make_scene(small, frame, volume, reading)
-        self._first = self._halves(1)
 
     def opacity(self) -> float:
-        return _opacity(self._first)
+        return _opacity(self._halves(1))
 
     def measure(self) -> Measure:
         """After a first look of one sample, with as many as the frame's noise is worth."""
-        sampling, whole = self._shot.sampling, self._first
+        sampling = self._shot.sampling
         assert sampling.tolerance is not None  # the shot's own check
-        noise = max(half.relative_error() for half in whole)
-        wanted = min((noise / sampling.tolerance) ** 2, sampling.samples)
+        layered = self._halves(1, PILOT_ORDERS)
+        noise = [half.relative_error() for half in layered]
+        wanted = min((max(noise) / sampling.tolerance) ** 2, sampling.samples)
         samples = int(min(max(1.0, self._share * wanted), PILOT_SAMPLES))
         if samples > 1:
+            layered = self._halves(samples, PILOT_ORDERS)
+        layers = np.stack([_planes(half, [*_ORDERS, ""]) for half in layered])
+        images, cut_off = layers[:, :, -1].copy(), 0
+        layers[:, :, -1] = 0.0  # what comes after the last order
+        if layers[:, :, -2].any():
             whole = self._halves(samples)
-        layered = self._halves(samples, PILOT_ORDERS)
-        tails = [
-            _tail(
-                *((u.channels(name), v.channels(name)) for u, v in zip(whole, layered, strict=True))
-            )
-            for name in whole[0].looks
-        ]
-        if any(half.bounded_paths for half in whole):
-            tails.append(
-                np.ones(PILOT_ORDERS + 1)
-            )  # what the bound on work cut off may be anything
-        return Measure(np.max(tails, axis=0), _opacity(whole))
+            layers[:, :, -1] = [_planes(half, [""])[:, 0] for half in whole] - images
+            images += layers[:, :, -1]
+            cut_off = sum(half.bounded_paths for half in whole)
+        tails = [_tail(layers[:, look], images[:, look]) for look in range(layers.shape[1])]
+        if cut_off:
+            tails.append(np.ones(PILOT_ORDERS + 1))  # of what was cut off nothing is known
+        return Measure(np.max(tails, axis=0), _opacity(layered), sum(noise) / 2)
 
     def _halves(self, samples: int, orders: int | None = None) -> tuple[core.Partial, core.Partial]:
         """With every order of scattering, or some of them each for itself, on the same paths."""
@@ -228,13 +231,19 @@ def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
     return max(0.001, sum(half.opacity for half in halves) / 2)
 
 
-def _tail(a: tuple[Channels, Channels], b: tuple[Channels, Channels]) -> NDArray[np.float64]:
-    """What is left out, from two halves, each whole and by order, in blocks of pixels; and two
+def _planes(half: core.Partial, layers: Sequence[str]) -> Planes:
+    """The named layers, of shape (looks, layers, 3, rows, columns)."""
+    looks = [half.channels(look) for look in half.looks]
+    return np.array([[[look[layer + c] for c in "RGB"] for layer in layers] for look in looks])
+
+
+def _tail(layers: Planes, images: Planes) -> NDArray[np.float64]:
+    """What the orders from N on bring, N = 0 .. 32, from two halves, in blocks of pixels; and two
     standard errors more. Few paths may all end early; but light falls from order to order ever more
     slowly, so none is taken to leave less than the first two let expect."""
-    images = np.array([whole[c] for whole, _ in (a, b) for c in "RGB"])
-    level = _blocks(images).mean(axis=0)
-    products = np.mean(_rests(*a) * _rests(*b), axis=1) / (level**2 + 0.01)
+    rests = np.cumsum(_blocks(layers)[:, ::-1], axis=1)[:, ::-1]
+    level = _blocks(images).mean(axis=(0, 1))
+    products = np.mean(rests[0] * rests[1], axis=1) / (level**2 + 0.01)
     blocks = (1, 2)
     upper = products.mean(blocks) + 2 * products.std(blocks) / math.sqrt(level.size)
     falling = np.maximum(np.maximum.accumulate(upper[::-1])[::-1], 0.0)
@@ -244,22 +253,16 @@ def _tail(a: tuple[Channels, Channels], b: tuple[Channels, Channels]) -> NDArray
     return np.asarray(np.sqrt(falling))
 
 
-def _rests(whole: Channels, layered: Channels) -> NDArray[np.float64]:
-    """What the orders from N on bring, N = 0 .. 32, of shape (33, 3, rows, columns) in blocks."""
-    names = [f"order{order:02d}" for order in range(PILOT_ORDERS)]
-    layers = [[layered[f"{name}.{c}"] for c in "RGB"] for name in names]
-    layers.append([whole[c] - layered[c] for c in "RGB"])
-    return np.asarray(np.cumsum(_blocks(np.array(layers))[::-1], axis=0)[::-1])
-
-
-def _blocks(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+def _blocks(planes: Planes) -> NDArray[np.float64]:
     """The means of blocks of pixels, the last two axes; those at the far edges are smaller."""
     values = planes.astype(np.float64)
-    for axis in (-2, -1):
-        starts = range(0, planes.shape[axis], BLOCK)
-        counts = np.diff([*starts, planes.shape[axis]])
-        sums = np.add.reduceat(values, starts, axis)
-        values = np.asarray(sums / (counts[:, None] if axis == -2 else counts))
+    for _ in range(2):  # along the rows, then along the columns
+        sums = values[..., ::BLOCK].copy()
+        for place in range(1, BLOCK):
+            further = values[..., place::BLOCK]
+            sums[..., : further.shape[-1]] += further
+        edges = [*range(0, values.shape[-1], BLOCK), values.shape[-1]]
+        values = (sums / np.diff(edges)).swapaxes(-1, -2)
     return values
 
 
@@ -267,7 +270,11 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
     """The smallest model whose shortfalls leave more than half of the tolerance's square."""
     tolerance = shot.sampling.tolerance
     assert tolerance is not None  # the shot's own check
-    depth, cut = _depth(measure, tolerance / 8, earlier)
+    limits = np.full(PILOT_ORDERS, tolerance / 8)
+    # Single scattering has no other shortfall, and no frame takes less than a sample a pixel: it
+    # may have half of what the noise of one leaves.
+    limits[1] = max(limits[1], (tolerance - measure.noise) / 2)
+    depth, cut = _depth(measure, limits, earlier)
     if shot.transport.max_bounces is not None and (
         depth is None or shot.transport.max_bounces < depth
     ):
@@ -309,15 +316,18 @@ def _sun_share(shot: Shot) -> float:
     return 1.0 if math.isinf(suns) or suns + sky == 0 else suns / (suns + sky)
 
 
-def _depth(measure: Measure, limit: float, earlier: Resolved | None) -> tuple[int | None, float]:
-    """The fewest orders that leave out at most the limit, and what they leave out; None: all."""
+def _depth(
+    measure: Measure, limits: NDArray[np.float64], earlier: Resolved | None
+) -> tuple[int | None, float]:
+    """The fewest orders that leave out at most their limit, and what they leave out; None: all."""
+    tail, most = measure.tail, PILOT_ORDERS // 2
     if earlier is not None:
         kept = earlier.max_bounces
-        if kept is not None and kept < PILOT_ORDERS and measure.tail[kept] <= limit * HYSTERESIS:
-            return kept, float(measure.tail[kept])
-        if kept is None and measure.tail[PILOT_ORDERS // 2] > limit / HYSTERESIS:
+        if kept is not None and kept < PILOT_ORDERS and tail[kept] <= limits[kept] * HYSTERESIS:
+            return kept, float(tail[kept])
+        if kept is None and tail[most] > limits[most] / HYSTERESIS:
             return None, 0.0
-    for orders in range(1, PILOT_ORDERS // 2 + 1):
-        if measure.tail[orders] <= limit:
-            return orders, float(measure.tail[orders])
+    for orders in range(1, most + 1):
+        if tail[orders] <= limits[orders]:
+            return orders, float(tail[orders])
     return None, 0.0
