@@ -129,12 +129,17 @@ def test_auto_decides_and_samples_in_the_farm_as_here(
             "sampling": Sampling(samples=512, tolerance=0.1, seed=7),
         }
     )
-    finish(client, client.submit(shot).job.id)
+    job = client.submit(shot).job.id
+    finish(client, job)
     file = tmp_path / "shot.json"
     file.write_text(shot.model_dump_json())
     command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
     ended = subprocess.run(command, check=True, capture_output=True, text=True)
-    for report in json.loads(ended.stdout)["frames"]:
+    reports = json.loads(ended.stdout)["frames"]
+    # What was taken is told, not what might have been.
+    most = sum(report["samples"] + 0.5 for report in reports)
+    assert 0 < client.job(job).samples <= most * shot.image.width * shot.image.height
+    for report in reports:
         assert report["method"] == "similarity"
         assert report["error"] <= 0.1
         assert 4 <= report["samples"] < 512

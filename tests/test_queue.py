@@ -55,7 +55,7 @@ def do(queue: Queue, task: Task, info: WorkerInfo = A, tasks: int = 3) -> bool:
     """Completes a task as a worker would, each plan with so many tasks."""
     results: dict[Kind, Planned | Rendered | Merged] = {
         Kind.PLAN: planned(tasks),
-        Kind.RENDER: Rendered(samples=10),
+        Kind.RENDER: Rendered(samples=10, taken=10),
         Kind.MERGE: Merged(),
     }
     return queue.complete(task, info.name, results[task.kind])

@@ -76,7 +76,7 @@ def test_a_frame_stays_with_the_version_that_planned_it(redis: Redis) -> None:
     parts = []
     while task := queue.claim(OTHER_OLD):
         parts.append(task.part)
-        result = Rendered(samples=10) if task.kind is Kind.RENDER else Merged()
+        result = Rendered(samples=10, taken=10) if task.kind is Kind.RENDER else Merged()
         queue.complete(task, OTHER_OLD.name, result)
     assert parts[:3] == [0, 1, 2]
     seen = queue.job("job")
@@ -98,14 +98,14 @@ def test_a_frame_whose_version_is_gone_is_planned_anew(redis: Redis) -> None:
     queue = planned_by_old(redis, plan("1"))
     task = queue.claim(OLD)
     assert task
-    queue.complete(task, OLD.name, Rendered(samples=10))
+    queue.complete(task, OLD.name, Rendered(samples=10, taken=10))
     left = queue.claim(OLD)
     assert left and left.kind is Kind.RENDER
     queue.leave(OLD.name)
     task = queue.claim(NEW)
     assert task and task.kind is Kind.RENDER
     queue.complete(task, NEW.name, Replan())
-    assert not queue.complete(left, "nobody", Rendered(samples=10))
+    assert not queue.complete(left, "nobody", Rendered(samples=10, taken=10))
     time.sleep(LEASE * 1.2)
     # The lease of the one that left runs out amid the new plan; nothing is lost or counted twice.
     done: list[tuple[str, int]] = []
@@ -113,7 +113,7 @@ def test_a_frame_whose_version_is_gone_is_planned_anew(redis: Redis) -> None:
         done.append((task.kind, task.part))
         results: dict[Kind, Result] = {
             Kind.PLAN: Planned(tasks=1, finished=[], total=10, samples=0, version="2"),
-            Kind.RENDER: Rendered(samples=10),
+            Kind.RENDER: Rendered(samples=10, taken=10),
             Kind.MERGE: Merged(),
         }
         queue.complete(task, NEW.name, results[task.kind])

@@ -36,7 +36,7 @@ def worker(number: int) -> WorkerInfo:
 def result(task: Task, tasks: int = TASKS) -> Result:
     if task.kind is Kind.PLAN:
         return Planned(tasks=tasks, finished=[], total=tasks * 1000, samples=0)
-    return Rendered(samples=1000) if task.kind is Kind.RENDER else Merged()
+    return Rendered(samples=1000, taken=1000) if task.kind is Kind.RENDER else Merged()
 
 
 def submit(queue: Queue, job: str, frames: int, priority: int = 5) -> None:

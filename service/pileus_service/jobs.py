@@ -178,7 +178,11 @@ class Planned(Record):
 
 
 class Rendered(Record):
+    """A part's result: its pixel samples as planned, by which progress is told, and those that were
+    taken, which are fewer where a tolerance was met."""
+
     samples: int
+    taken: int
 
 
 class Merged(Record):

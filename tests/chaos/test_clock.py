@@ -75,8 +75,8 @@ def test_a_clock_set_forward_takes_tasks_from_the_living_and_no_result(
     assert again is not None
     assert again.entry == task.entry
     assert queue.renew(task, A) == "lost"
-    assert not queue.complete(task, "A", Rendered(samples=1))
-    assert queue.complete(again, "B", Rendered(samples=1))
+    assert not queue.complete(task, "A", Rendered(samples=1, taken=1))
+    assert queue.complete(again, "B", Rendered(samples=1, taken=1))
     merge = queue.claim(A)
     assert merge is not None
     assert merge.kind is Kind.MERGE

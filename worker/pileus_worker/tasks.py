@@ -91,7 +91,7 @@ class Work:
         self._tidy(files)
         if self.kind is Kind.PLAN:
             return Planned(tasks=0, finished=[], total=0, samples=0)
-        return Rendered(samples=0) if self.kind is Kind.RENDER else Merged()
+        return Rendered(samples=0, taken=0) if self.kind is Kind.RENDER else Merged()
 
     def _plan(self, files: FrameStore) -> Planned | Waiting:
         """Makes the frame's plan, or takes up one that is there, with what it has finished."""
@@ -194,7 +194,8 @@ class Work:
     def _render(self, files: FrameStore, plan: Plan) -> Rendered:
         part = plan.parts[self.part]
         path = files.part(part)
-        if not self._whole(files, part, plan):
+        partial = self._whole(files, part, plan)
+        if partial is None:
             view = self._scene(plan.files)
             if self.read_ahead:
                 self._begin_next()
@@ -205,7 +206,8 @@ class Work:
                 partial.write(str(path), plan.identity)
             if files.done() is not None:
                 self._tidy(files)  # we were late, and others have swept already
-        return Rendered(samples=part.pixel_samples)
+        taken = part.model_copy(update={"samples": partial.samples})
+        return Rendered(samples=part.pixel_samples, taken=taken.pixel_samples)
 
     def _merge(self, files: FrameStore, plan: Plan) -> Merged:
         """Writes the image from the partials; those missing or damaged are to be made again."""
@@ -302,12 +304,12 @@ class Work:
         for file in set(read) - set(now):
             raise StaleError(f"{file.path}: changes while its frame is rendered")
 
-    def _whole(self, files: FrameStore, part: Part, plan: Plan) -> bool:
-        """Whether a partial is there already, from an attempt whose completion was not heard."""
+    def _whole(self, files: FrameStore, part: Part, plan: Plan) -> core.Partial | None:
+        """A partial that is there already, from an attempt whose completion was not heard."""
         try:
-            return files.part(part).exists() and bool(self._read(files, part, plan))
+            return self._read(files, part, plan) if files.part(part).exists() else None
         except core.InputError:
-            return False
+            return None
 
     def _read(self, files: FrameStore, part: Part, plan: Plan) -> core.Partial:
         """A partial of this very frame; a damaged or foreign one is removed, to be made again."""

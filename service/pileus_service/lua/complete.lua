@@ -56,8 +56,9 @@ elseif task.kind == 'render' then
   if redis.call('SETBIT', at .. ':bits', task.part, 1) == 0 then
     redis.call('HINCRBY', at, 'done', 1)
     redis.call('HINCRBY', at, 'samples', result.samples)
-    redis.call('HINCRBY', key, 'samples', result.samples)
-    count('samples', result.samples)
+    local taken = result.taken or result.samples  -- an older worker tells only these
+    redis.call('HINCRBY', key, 'samples', taken)
+    count('samples', taken)
     merge_if_whole()
   end
 elseif #result.redo > 0 then
