@@ -30,7 +30,7 @@ class Agreement:
         self._queue = queue
         self._hooks = hooks
         self.lock = threading.RLock()
-        self._wishes: dict[str, Wish] = {}
+        self._wished: dict[str, Standing] = {}
         self._seen: Mark | None = None
         self._compared = 0.0
 
@@ -58,14 +58,14 @@ class Agreement:
             # First the notice: an end that is on disk is not looked at again.
             self._hooks.note_end(job, wish)
         self._store.wish(job_id, wish)
-        self._wishes[job_id] = wish
+        self._wished[job_id] = _standing(wish)
 
     def forget(self, job_id: str) -> None:
-        self._wishes.pop(job_id, None)
+        self._wished.pop(job_id, None)
 
     def states(self) -> Counter[str]:
         """How many jobs are in each state, as of the last look; those not begun are running."""
-        return Counter(wish.state for wish in list(self._wishes.values()))
+        return Counter(wish.state for wish in list(self._wished.values()))
 
     def restore(self, job_id: str) -> bool:
         """Puts a job of the disk into Redis; what it has finished stays finished."""
@@ -81,15 +81,15 @@ class Agreement:
     def _compare_all(self) -> None:
         # Redis first: what is on no disk by now was removed, and not just submitted.
         in_redis = set(self._all_in_redis())
-        on_disk = set(_slowly(self._store.job_ids(known=self._wishes)))
+        on_disk = set(_slowly(self._store.job_ids(known=self._wished)))
         for job_id in in_redis - on_disk:
             self._queue.control(job_id, "remove")
-        for job_id in self._wishes.keys() - on_disk:
+        for job_id in self._wished.keys() - on_disk:
             self.forget(job_id)
         astray = [
             (job_id, standing)
             for job_id, standing in self._standings(list(on_disk))
-            if standing != _standing(self._wish(job_id))
+            if standing != self._wish(job_id)
         ]
         # Of many that Redis has lost, those with work to do come back first.
         for job_id, standing in sorted(
@@ -110,18 +110,18 @@ class Agreement:
             yield from zip(page, self._queue.standings(page), strict=True)
             time.sleep(BREATH)
 
-    def _wish(self, job_id: str) -> Wish:
-        wish = self._wishes.get(job_id)
+    def _wish(self, job_id: str) -> Standing:
+        wish = self._wished.get(job_id)
         if wish is None:
-            wish = self._wishes[job_id] = self._store.wished(job_id)
+            wish = self._wished[job_id] = _standing(self._store.wished(job_id))
         return wish
 
     def _agree(self, job_id: str, standing: Standing | None) -> None:
-        if standing == _standing(self._wish(job_id)):
+        if standing == self._wish(job_id):
             return
         with self.lock:
             # Another may have written since; what is on disk now holds.
-            self._wishes[job_id] = wish = self._store.wished(job_id)
+            wish = self._wished[job_id] = _standing(self._store.wished(job_id))
             [now] = self._queue.standings([job_id])
             if now is None:
                 self.restore(job_id)
@@ -145,7 +145,7 @@ class Agreement:
                 {
                     "state": state,
                     "priority": view.priority,
-                    "life": self._wishes[job_id].life,
+                    "life": self._wished[job_id].life,
                     "finished": view.finished,
                     "failed": self._queue.failed(job_id),
                 }

@@ -1,6 +1,7 @@
 """Runs the service: uvicorn over the app, on a private or a shared Redis."""
 
 import contextlib
+import gc
 import socket
 from pathlib import Path
 
@@ -63,4 +64,7 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
 def serve(data: Path, redis_url: str, roots: list[Path], listen: str) -> None:
     logs.configure()
     with contextlib.closing(bind(listen)) as listener:
-        make_server(data, redis_url, roots, listen).run([listener])
+        server = make_server(data, redis_url, roots, listen)
+        # What is loaded by now stays: no full collection is to look through it while requests wait.
+        gc.freeze()
+        server.run([listener])
