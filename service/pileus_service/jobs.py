@@ -227,7 +227,8 @@ class WorkerInfo(Record):
 
 
 class Doing(Record):
-    """A worker's task in a user's words: the frame by its number, what of it, how far."""
+    """A worker's task in a user's words: the frame by its number, what of it (with a tolerance the
+    samples are the most that it may take), how far."""
 
     job: JobId
     frame: int
