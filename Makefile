@@ -59,7 +59,7 @@ lint: setup
 	$(VENV)/bin/ruff check service worker bench tests
 	$(VENV)/bin/ruff format --check service worker bench tests
 	$(VENV)/bin/mypy
-	find core -name '*.cpp' -o -name '*.h' | xargs clang-format --dry-run --Werror
+	find core -name '*.cpp' -o -name '*.h' -o -name '*.inc' | xargs clang-format --dry-run --Werror
 
 setup: $(VENV)/.system $(VENV)/.core $(VENV)/.pileus
 

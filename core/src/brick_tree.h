@@ -109,17 +109,6 @@ class BrickTree {
         return interpolate(x, cursor);
     }
 
-    /// The value of one of the eight voxels around x, drawn with its interpolation weight: its mean
-    /// is the interpolated field. The three jitters are uniform in [0, 1); x lies inside the root,
-    /// mostly in the brick of `near`.
-    float tap(const V3f& x, const V3f& jitter, const Cursor& near) const {
-        const V3i at(static_cast<int>(x.x + jitter.x), static_cast<int>(x.y + jitter.y),
-                     static_cast<int>(x.z + jitter.z));
-        const V3i from(at.x ^ near.low.x, at.y ^ near.low.y, at.z ^ near.low.z);
-        if ((from.x | from.y | from.z) & ~(width - 1)) return voxel(at);
-        return value(near.found, at);
-    }
-
     /// The cells around one cell inside the root, with the majorant of the field over them.
     Cells cells(const V3i& cell) const {
         const Node* node = &nodes_[0];
@@ -142,14 +131,28 @@ class BrickTree {
         return scale_ * decode_half(lowest.max[entry(cell, log2_width)]);
     }
 
-    /// The brick or constant at one of a lowest node's own voxels.
-    static Child child(const Node& lowest, const V3i& cell) {
-        return lowest.child[entry(cell, log2_width)];
-    }
-
     static int floor_int(float x) {
         const int truncated = static_cast<int>(x);
         return truncated - (static_cast<float>(truncated) > x);
+    }
+
+    // For who follows many rays at once: what the functions above read, as it lies in memory. After
+    // the last brick there is room for another.
+    const Node* nodes() const { return nodes_.data(); }
+    const Brick* bricks() const { return bricks_.get(); }
+    std::size_t node_count() const { return nodes_.size(); }
+    std::size_t brick_count() const { return brick_count_; }
+    float scale() const { return scale_; }
+    int levels() const { return levels_; }
+
+    /// The brick or constant that holds a voxel inside the root.
+    Child descend(const V3i& at) const {
+        Child child = 0;
+        for (int level = levels_; level > 0; --level) {
+            child = nodes_[child].child[entry(at, log2_width * level)];
+            if (child & constant_bit) break;
+        }
+        return child;
     }
 
   private:
@@ -165,16 +168,6 @@ class BrickTree {
     float value(Child found, const V3i& at) const {
         return scale_ * decode_half(found & constant_bit ? static_cast<Half>(found)
                                                          : bricks_[found][entry(at, 0)]);
-    }
-
-    /// The brick or constant that holds a voxel inside the root.
-    Child descend(const V3i& at) const {
-        Child child = 0;
-        for (int level = levels_; level > 0; --level) {
-            child = nodes_[child].child[entry(at, log2_width * level)];
-            if (child & constant_bit) break;
-        }
-        return child;
     }
 
     std::vector<Node> nodes_;  // the root first

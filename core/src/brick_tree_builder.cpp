@@ -121,7 +121,7 @@ class BrickTreeBuilder {
     BrickTreeBuilder(int levels, std::size_t brick_count) {
         tree_.levels_ = levels;
         tree_.extent_ = 1 << (BrickTree::log2_width * (levels + 1));
-        tree_.bricks_ = std::make_unique_for_overwrite<BrickTree::Brick[]>(brick_count);
+        tree_.bricks_ = std::make_unique_for_overwrite<BrickTree::Brick[]>(brick_count + 1);
         tree_.brick_count_ = brick_count;
         sides_.resize(brick_count);
         add_node(levels, V3i(0), BrickTree::constant(0));

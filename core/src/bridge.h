@@ -10,7 +10,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <span>
 
 namespace pileus {
 
@@ -61,11 +60,6 @@ class Chain {
 
     /// The direction in which a bridge with so many events leaves the walk.
     const V3f& first(int events) const { return direction_[static_cast<std::size_t>(events - 1)]; }
-
-    /// Its directions, the last before the light first.
-    std::span<const V3f> directions(int events) const {
-        return {direction_.data(), static_cast<std::size_t>(events)};
-    }
 
     /// The inverse densities of its choices, summed.
     float inverse(int events) const { return inverse_[static_cast<std::size_t>(events - 1)]; }

@@ -19,11 +19,9 @@ struct LocalRay {
     V3f at(float t) const { return origin + direction * t; }
 };
 
-/// A stretch [begin, end) of a ray with one majorant of the interpolated density, and the brick
-/// that it lies in, where it is one.
+/// A stretch [begin, end) of a ray with one majorant of the interpolated density.
 struct MajorantSegment {
     float begin, end, majorant;
-    BrickTree::Cursor brick;
 };
 
 /// Three axes and a spare lane, for arithmetic on all at once (GCC's and Clang's vectors).
@@ -69,7 +67,7 @@ class MajorantIterator {
                 const BrickTree::Cells cells = tree_->cells(brick);
                 node_ = cells.lowest;
                 if (!node_) {
-                    segment = {t_, 0.0f, cells.majorant, {}};
+                    segment = {t_, 0.0f, cells.majorant};
                     step_out_of(cells);
                     segment.end = t_;
                     if (segment.majorant > 0.0f && segment.end > segment.begin) return true;
@@ -78,7 +76,6 @@ class MajorantIterator {
             }
             segment.begin = t_;
             segment.majorant = tree_->majorant(*node_, brick);
-            if (segment.majorant > 0.0f) segment.brick = {brick, BrickTree::child(*node_, brick)};
             step();
             segment.end = t_;
             if (segment.majorant > 0.0f && segment.end > segment.begin) return true;

@@ -6,7 +6,6 @@
 
 #include "majorants.h"
 #include "phase.h"
-#include "random.h"
 #include "volume.h"
 
 #include <algorithm>
@@ -71,18 +70,12 @@ class Medium {
         return bounded(tree_->interpolate(x, cursor));
     }
 
-    /// An unbiased estimate of sigma_t at a position of a segment, which reads a single voxel and
-    /// is never above the segment's majorant.
-    float extinction_tap(const V3f& x, const MajorantSegment& segment, Random& random) const {
-        const std::uint64_t bits = random.bits();
-        const auto jitter = [bits](int shift) {
-            return static_cast<float>((bits >> shift) & 0x1fffff) * 0x1p-21f;
-        };
-        return bounded(tree_->tap(x, V3f(jitter(0), jitter(21), jitter(42)), segment.brick));
-    }
-
     /// The stretches of a ray that may hold anything, with majorants of the density.
     MajorantIterator majorants(const LocalRay& ray) const { return {*tree_, ray}; }
+
+    /// What `bounded` reads: sigma_t at density 1, and the most that it may be.
+    float coefficient() const { return extinction_; }
+    float thickest() const { return thickest_; }
 
     /// The majorant of sigma_t where that of the density is given.
     float majorant(float density) const { return bounded(density); }

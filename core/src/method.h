@@ -2,7 +2,8 @@
 // marches and the tracking; a new one is a file under methods/ and a line in method.cpp.
 #pragma once
 
-#include "path.h"
+#include "direct_light.h"
+#include "paths.h"
 
 #include <memory>
 #include <string>
@@ -10,14 +11,23 @@
 
 namespace pileus {
 
+/// What a path in flight works with; the next path takes it over.
+struct PathKit {
+    PathKit(Tracker& with, std::size_t lights) : tracker(with), bridges(lights) {}
+    Tracker& tracker;
+    ShadowRays shadows;
+    Bridges bridges;
+};
+
 /// One thread's instance of a method. Scene and transport outlive it.
 class Method {
   public:
     virtual ~Method() = default;
 
-    /// Follows the part of a camera ray that lies in the volume, and adds what it finds to the
-    /// record.
-    virtual void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) = 0;
+    /// A path that follows the part of a camera ray that lies in the volume, and adds what it finds
+    /// to the record. All that is given, and the method, must outlive the path.
+    virtual Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
+                       PathKit& kit) = 0;
 };
 
 /// The names a transport may have, in the order of the table in docs/methods.md.

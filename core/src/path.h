@@ -1,16 +1,14 @@
-// One sample of one pixel: its random numbers, what it finds, and the routine that gathers direct
-// light at a scatter event by Eq. 1.
+// One sample of one pixel: its random numbers, its scatter events and what it finds.
 #pragma once
 
 #include "bridge.h"
+#include "geometry.h"
 #include "random.h"
-#include "scene.h"
-#include "schedule.h"
 
+#include <algorithm>
 #include <array>
 #include <cstdint>
 #include <optional>
-#include <span>
 #include <vector>
 
 namespace pileus {
@@ -111,69 +109,6 @@ struct ScatterEvent {
     V3f direction;            // world, unit: the way the walk arrived
     Color weight;             // of the path up to here, this event's albedo included
     RecentChoices choices{};  // of the directions up to here
-};
-
-/// How a method flies from event to event.
-enum class Flights {
-    tracked,  // delta tracking, unbiased
-    other
-};
-
-/// Adds the direct light at an event, Eq. 1 for the orders of the events [first, last), to every
-/// look: for each light
-///   sigma_s b^i L p(w_i, w_o, c^i g) exp(-a^i integral of sigma_t to the light).
-/// Looks share the directions, and the shadow rays where they share the power a^i.
-///
-/// Where flights are tracked, two more techniques find the same light with less noise:
-/// - the sky reaches a physical look (a = b = c = 1) by the walk itself as it leaves the medium, at
-///   no cost (`add_escape`);
-/// - distant lights are also reached by bridges (`add_bridges`). Of a path's last phase functions p
-///   one is then evaluated and the others sampled. Weighed by the balance heuristic (Veach 1997)
-///   every technique counts the same, the harmonic sum 1 / (sum of 1 / p): it has a peak only where
-///   all of them do.
-class DirectLight {
-  public:
-    DirectLight(const Scene& scene, const Schedule& schedule, const std::vector<Look>& looks,
-                Flights flights);
-
-    void add(const ScatterEvent& event, int first, int last, const PathRandom& random,
-             PathRecord& record);
-
-    /// Adds the light that reaches event n by way of further events, up to event `end`, between it
-    /// and each distant light.
-    void add_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
-                     PathRecord& record);
-
-    /// Adds what a walk that has left the medium sees of the sky, for the physical looks: it
-    /// scattered into `direction` at event n, of which 1 / density is given, and met nothing more.
-    void add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density, int n,
-                    PathRecord& record) const;
-
-  private:
-    struct Term {
-        std::size_t look;
-        int order;
-        float weight;
-        HenyeyGreenstein phase;
-        float power;
-        bool walk;  // its sky comes by the walk
-    };
-
-    void set_terms(int first, int last);
-    bool bridged(int n) const;
-    const std::optional<Chain>& chain(std::size_t light, int n, const PathRandom& random);
-    std::optional<ScatterEvent> fly(const ScatterEvent& from, int n, std::span<const V3f> chain,
-                                    Random& random) const;
-
-    const Scene& scene_;
-    const Schedule& schedule_;
-    const std::vector<Look>& looks_;
-    bool tracked_;
-    bool all_walk_;
-    int first_ = -1, last_ = -1;
-    std::vector<Term> terms_;
-    int reach_;  // the most events of a bridge; 0 where there are none
-    std::vector<std::optional<Chain>> chains_;  // by light
 };
 
 }  // namespace pileus

@@ -32,7 +32,7 @@ class HenyeyGreenstein {
     /// A direction drawn from `density`, from u1, u2 in [0, 1).
     V3f sample(const V3f& in, float u1, float u2) const {
         const V3f axis = g_ >= 0.0f ? in : -in;
-        return direction_about(axis, one_minus_cos(u1), 2.0f * pi * u2);
+        return direction_about(axis, one_minus_cos(u1), u2);
     }
 
   private:

@@ -35,11 +35,11 @@ class Random {
 
     constexpr std::uint64_t bits() { return mix64(state_ += 0x9e3779b97f4a7c15ULL); }
 
+    /// A stream with this key goes on as this one will.
+    constexpr std::uint64_t state() const { return state_; }
+
     /// Uniform in [0, 1).
     constexpr float uniform() { return unit_float(static_cast<std::uint32_t>(bits() >> 32)); }
-
-    /// Exponentially distributed with mean 1; finite.
-    float exponential() { return pileus::exponential(uniform()); }
 
   private:
     std::uint64_t state_;

@@ -7,6 +7,8 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
+#include <algorithm>
+#include <array>
 #include <cmath>
 
 namespace pileus {
@@ -18,9 +20,9 @@ class PixelSums {
   public:
     PixelSums(std::size_t looks, std::size_t orders, bool keep_orders)
         : keep_orders_(keep_orders),
-          sum_(looks),
-          squares_(looks),
-          order_sums_(keep_orders ? looks * orders : 0) {}
+          sum_(looks, V3d(0.0)),
+          squares_(looks, V3d(0.0)),
+          order_sums_(keep_orders ? looks * orders : 0, V3d(0.0)) {}
 
     void clear() {
         std::fill(sum_.begin(), sum_.end(), V3d(0.0));
@@ -75,25 +77,72 @@ class PixelSums {
     double opacity_ = 0.0, depth_ = 0.0;
 };
 
-/// One thread's instance of all that changes along a path.
-struct Workspace {
-    Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
-        : method(make_method(scene, transport)),
-          record(transport.looks.size(), orders),
-          sums(transport.looks.size(), orders, keep_orders) {}
-    std::unique_ptr<Method> method;
-    PathRecord record;
-    PixelSums sums;
+/// A sample that is to be traced.
+struct Sample {
+    std::size_t pixel;
+    bool last;  // of its pixel
+    CameraRay ray;
+    PathRandom random;
 };
 
-void trace_sample(const Scene& scene, int x, int y, const PathRandom& random, Method& method,
-                  PathRecord& record) {
-    record.clear();
-    const CameraRay ray =
-        scene.camera_ray(x + double{random.first[0]}, y + double{random.first[1]});
-    if (ray.volume) method.trace(ray, random, record);
-    if (scene.background && record.opacity < 1.0f)
-        record.sky = scene.sky(ray.direction) * (1.0f - record.opacity);
+/// What one thread traces with.
+struct Workspace {
+    // Enough paths in flight that the tracker's lanes stay full, and few enough to lie in a cache.
+    static constexpr std::size_t in_flight = 256;
+    // So many samples are traced before they are summed in their order: the more, the longer the
+    // lanes stay full.
+    static constexpr std::size_t gathered = 8192;
+
+    Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
+        : method(make_method(scene, transport)),
+          tracker(std::make_unique<Tracker>(scene.volume->tree())),
+          kits(in_flight, PathKit(*tracker, scene.lights.size())),
+          blank(transport.looks.size(), orders),
+          sums(transport.looks.size(), orders, keep_orders),
+          most(std::clamp<std::size_t>(
+              (std::size_t{8} << 20) / (transport.looks.size() * orders * sizeof(Color)), 16,
+              gathered)) {}
+
+    std::unique_ptr<Method> method;
+    std::unique_ptr<Tracker> tracker;
+    std::vector<PathKit> kits;
+    std::vector<Sample> samples;
+    std::vector<PathRecord> records;  // as many as there were samples
+    PathRecord blank;
+    PixelSums sums;
+    std::size_t most;  // samples, so that their records take a few MiB
+};
+
+/// Traces the samples into their records.
+void trace(Workspace& work, const Scene& scene, const Control& control) {
+    if (work.records.size() < work.samples.size())
+        work.records.resize(work.samples.size(), work.blank);
+    std::array<Path, Workspace::in_flight> paths;
+    std::size_t next = 0;
+    const auto goes_on = [&](std::size_t slot) {
+        while (!paths[slot].resume()) {
+            if (next == work.samples.size()) return false;
+            const Sample& sample = work.samples[next];
+            PathRecord& record = work.records[next++];
+            record.clear();
+            if (sample.ray.volume)
+                paths[slot] =
+                    work.method->trace(sample.ray, sample.random, record, work.kits[slot]);
+        }
+        return true;
+    };
+    for (std::size_t flying = paths.size(); flying > 0;) {
+        if (control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
+        flying = 0;
+        for (std::size_t slot = 0; slot < paths.size(); ++slot) flying += goes_on(slot) ? 1 : 0;
+        work.tracker->run();
+    }
+    if (!scene.background) return;
+    for (std::size_t i = 0; i < work.samples.size(); ++i) {
+        PathRecord& record = work.records[i];
+        if (record.opacity < 1.0f)
+            record.sky = scene.sky(work.samples[i].ray.direction) * (1.0f - record.opacity);
+    }
 }
 
 void check(const Scene& scene, const Transport& transport, const RenderTask& task) {
@@ -131,33 +180,52 @@ Partial render(const Scene& scene, const Transport& transport, const RenderTask&
     tbb::enumerable_thread_specific<Workspace> workspaces(
         [&] { return Workspace(scene, transport, orders, task.orders); });
 
-    const auto render_pixel = [&](int x, int y) {
-        auto& [method, record, sums] = workspaces.local();
+    // Traces what a thread has gathered.
+    const auto settle = [&](Workspace& work) {
+        trace(work, scene, control);
+        for (std::size_t i = 0; i < work.samples.size(); ++i) {
+            const Sample& sample = work.samples[i];
+            if (work.records[i].bounded) bounded.fetch_add(1, std::memory_order_relaxed);
+            work.sums.add(work.records[i]);
+            if (!sample.last) continue;
+            work.sums.store(partial.image, sample.pixel, task.samples.count());
+            work.sums.clear();
+            control.samples_done.fetch_add(task.samples.count(), std::memory_order_relaxed);
+        }
+        work.samples.clear();
+    };
+
+    const auto gather_pixel = [&](Workspace& work, int x, int y) {
         const std::uint64_t pixel_key = hash_key(hash_key(frame_key, static_cast<std::uint64_t>(y)),
                                                  static_cast<std::uint64_t>(x));
-        sums.clear();
-        for (int sample = task.samples.first; sample < task.samples.last; ++sample) {
-            if (control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
-            const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample));
-            trace_sample(scene, x, y, random, *method, record);
-            if (record.bounded) bounded.fetch_add(1, std::memory_order_relaxed);
-            sums.add(record);
-        }
         const auto pixel = static_cast<std::size_t>(y - task.bucket.y0) *
                                static_cast<std::size_t>(task.bucket.width()) +
                            static_cast<std::size_t>(x - task.bucket.x0);
-        sums.store(partial.image, pixel, task.samples.count());
-        control.samples_done.fetch_add(task.samples.count(), std::memory_order_relaxed);
+        for (int sample = task.samples.first; sample < task.samples.last; ++sample) {
+            const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample));
+            work.samples.push_back(
+                {pixel, sample + 1 == task.samples.last,
+                 scene.camera_ray(x + double{random.first[0]}, y + double{random.first[1]}),
+                 random});
+            if (work.samples.size() == work.most) settle(work);
+        }
     };
 
+    // Tiles of enough samples to be traced together.
+    const int side = std::clamp(
+        static_cast<int>(std::sqrt(double{Workspace::gathered} / task.samples.count())), 4, 32);
     using Tiles = tbb::blocked_range2d<int>;
     tbb::task_arena arena(threads > 0 ? threads : tbb::task_arena::automatic);
     arena.execute([&] {
-        const Tiles tiles(task.bucket.y0, task.bucket.y1, 4, task.bucket.x0, task.bucket.x1, 4);
+        const Tiles tiles(task.bucket.y0, task.bucket.y1, static_cast<std::size_t>(side),
+                          task.bucket.x0, task.bucket.x1, static_cast<std::size_t>(side));
         tbb::parallel_for(tiles, [&](const Tiles& tile) {
+            Workspace& work = workspaces.local();
             for (int y = tile.rows().begin(); y != tile.rows().end(); ++y) {
-                for (int x = tile.cols().begin(); x != tile.cols().end(); ++x) render_pixel(x, y);
+                for (int x = tile.cols().begin(); x != tile.cols().end(); ++x)
+                    gather_pixel(work, x, y);
             }
+            settle(work);
         });
     });
     partial.bounded_paths = bounded;

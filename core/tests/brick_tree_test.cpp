@@ -144,28 +144,6 @@ TEST(BrickTree, KeepsALinearFieldWhereItIs) {
     }
 }
 
-TEST(BrickTree, TapsHaveTheFieldAsTheirMean) {
-    const BuiltTree built = build_brick_tree(test::noise_grid(12, 3, 1.0)->tree());
-    Random random(9);
-    constexpr int places = 50, taps = 40000;
-    for (int place = 0; place < places; ++place) {
-        const V3f x(7.0f + 13.0f * random.uniform(), 7.0f + 13.0f * random.uniform(),
-                    7.0f + 13.0f * random.uniform());
-        const BrickTree::Cells cells = built.tree.cells(V3i(x));
-        ASSERT_NE(cells.lowest, nullptr);
-        // From the brick that it is mostly in, and from none.
-        const BrickTree::Cursor cursors[] = {
-            {cells.low, BrickTree::child(*cells.lowest, cells.low)}, {}};
-        std::vector<double> values;
-        for (int i = 0; i < taps; ++i) {
-            values.push_back(built.tree.tap(
-                x, V3f(random.uniform(), random.uniform(), random.uniform()), cursors[i % 2]));
-        }
-        const auto [mean, error] = test::estimate(values);
-        EXPECT_NEAR(mean, built.tree.interpolate(x), test::z_limit(0.9999, places) * error + 1e-6);
-    }
-}
-
 TEST(BrickTree, MajorantsAreTheGreatestVoxelSeen) {
     for (const std::uint64_t key : {1u, 2u, 3u}) {
         const auto grid = random_sparse_grid(key);

@@ -130,7 +130,7 @@ TEST(RandomStreams, ExponentialsHaveTheirDistribution) {
     constexpr int count = 200000, bins = 64;
     std::vector<int> histogram(bins);
     for (int i = 0; i < count; ++i) {
-        const float value = random.exponential();
+        const float value = exponential(random.uniform());
         ASSERT_TRUE(std::isfinite(value) && value >= 0.0f);
         ++histogram[std::min<std::size_t>(bins - 1, std::size_t(-std::expm1(-value) * bins))];
     }

@@ -1,9 +1,8 @@
 // Delta tracking, ratio tracking and the density march against the exact optical depth of a rough
 // trilinear field.
-#include "tracking.h"
-
 #include "march.h"
 #include "support.h"
+#include "tracker.h"
 
 #include <array>
 #include <cmath>
@@ -45,6 +44,31 @@ class TrackingTest : public testing::Test {
                test::optical_depth(volume_->tree(), V3d(r.origin), V3d(r.direction), begin, end);
     }
 
+    /// What so many tracks like this one find, each by random numbers of its own.
+    std::vector<Track> follow(Estimator estimator, const Track& like, int count, std::uint64_t key,
+                              int width = Tracker::widths().back()) const {
+        std::vector<Track> tracks(static_cast<std::size_t>(count), like);
+        Tracker tracker(volume_->tree(), width);
+        for (std::size_t i = 0; i < tracks.size(); ++i) {
+            Track& track = tracks[i];
+            track.random = Random(hash_key(key, i));
+            track.first = track.random.uniform();
+            tracker.add(estimator, track);
+        }
+        tracker.run();
+        return tracks;
+    }
+
+    static Track along(const Medium& medium, const LocalRay& ray, float rate = 1.0f,
+                       float power = 1.0f) {
+        return {.medium = &medium,
+                .ray = ray,
+                .random = Random(0),
+                .first = 0.0f,
+                .power = power,
+                .rate = rate};
+    }
+
     static constexpr double everything = 20.0;  // world units: beyond the volume for all the rays
     int tests() const { return static_cast<int>(rays_.size()); }
 
@@ -56,8 +80,8 @@ class TrackingTest : public testing::Test {
 TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
     constexpr int samples = 200000, bins = 40;
     for (std::size_t r = 0; r < rays_.size(); ++r) {
-        const LocalRay& along = rays_[r];
-        const double opacity = -std::expm1(-depth(along, everything));
+        const LocalRay& way = rays_[r];
+        const double opacity = -std::expm1(-depth(way, everything));
         ASSERT_GT(opacity, 0.05);
         // Edges of equal probability, by bisection.
         std::vector<double> edges;
@@ -65,17 +89,16 @@ TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
             double low = 0.0, high = everything;
             for (int step = 0; step < 60; ++step) {
                 const double middle = 0.5 * (low + high);
-                (-std::expm1(-depth(along, middle)) < opacity * i / bins ? low : high) = middle;
+                (-std::expm1(-depth(way, middle)) < opacity * i / bins ? low : high) = middle;
             }
             edges.push_back(low);
         }
         std::vector<int> counts(bins + 1);  // the last are those that leave
-        Random random(100 + r);
-        for (int i = 0; i < samples; ++i) {
-            const auto t = delta_track(*medium_, along, random.exponential(), random);
-            ++counts[t ? std::size_t(std::upper_bound(edges.begin(), edges.end(), double(*t)) -
-                                     edges.begin())
-                       : std::size_t(bins)];
+        for (const Track& found :
+             follow(Estimator::collision, along(*medium_, way), samples, 100 + r)) {
+            const auto above = std::upper_bound(edges.begin(), edges.end(), double(found.distance));
+            ++counts[found.distance == Track::none ? std::size_t(bins)
+                                                   : std::size_t(above - edges.begin())];
         }
         double chi_square = 0.0;
         for (int i = 0; i <= bins; ++i) {
@@ -91,18 +114,18 @@ TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
 TEST_F(TrackingTest, ForcedCollisionsFollowTransmittanceTimesExtinctionByWeight) {
     constexpr int samples = 200000;
     constexpr std::array<double, 4> ends{0.6, 1.2, 2.4, everything};
-    const Medium thin(*volume_, 0.01f, Color(1.0f), 0.0f);  // where chances are made seldom ones
+    const Medium thin(*volume_, 0.01f, Color(1.0f), 0.0f);
     for (const Medium* const medium : std::array<const Medium*, 2>{&*medium_, &thin}) {
         const double share = medium->majorant(1.0f) / medium_->majorant(1.0f);
         for (std::size_t r = 0; r < rays_.size(); ++r) {
             std::array<std::vector<double>, ends.size()> before;
-            Random random(300 + r);
-            for (int i = 0; i < samples; ++i) {
-                const float rate = i % 2 == 0 ? 1.0f : 4.0f;
-                const auto [chance, distance] =
-                    forced_track(*medium, rays_[r], rate, random.exponential(), random);
-                for (std::size_t e = 0; e < ends.size(); ++e)
-                    before[e].push_back(distance < ends[e] ? chance : 0.0);
+            for (const float rate : {1.0f, 4.0f}) {
+                for (const Track& found :
+                     follow(Estimator::forced_collision, along(*medium, rays_[r], rate),
+                            samples / 2, 300 + r)) {
+                    for (std::size_t e = 0; e < ends.size(); ++e)
+                        before[e].push_back(found.distance < ends[e] ? found.weight : 0.0);
+                }
             }
             for (std::size_t e = 0; e < ends.size(); ++e) {
                 const double wanted = -std::expm1(-share * depth(rays_[r], ends[e]));
@@ -120,11 +143,13 @@ TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
     for (std::size_t r = 0; r < rays_.size(); ++r) {
         const double tau = depth(rays_[r], everything);
         for (const float power : powers) {
-            Random random(200 + r);
             std::vector<double> values;
-            for (int i = 0; i < samples; ++i) {
-                const float rate = i % 2 == 0 ? 1.0f : 2.5f;
-                values.push_back(ratio_track(*medium_, rays_[r], power, rate, random));
+            for (const float rate : {1.0f, 2.5f}) {
+                for (const Track& found :
+                     follow(Estimator::transmittance, along(*medium_, rays_[r], rate, power),
+                            samples / 2, 200 + r)) {
+                    values.push_back(found.weight);
+                }
             }
             const auto [mean, error] = test::estimate(values);
             const double limit = test::z_limit(0.9999, tests() * int(powers.size()));
@@ -138,13 +163,13 @@ TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
 TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
     // Optical depths of hundreds: nearly all estimates end early, by roulette.
     const Medium thick(*volume_, 60.0f, Color(1.0f), 0.0f);
-    for (const LocalRay& along : rays_) {
-        const double tau = 60.0 / 2.5 * depth(along, everything);
+    for (const LocalRay& way : rays_) {
+        const double tau = 60.0 / 2.5 * depth(way, everything);
         const float power = static_cast<float>(std::min(1.0, 3.0 / tau));
-        Random random(17);
         std::vector<double> values;
-        for (int i = 0; i < 100000; ++i) {
-            values.push_back(ratio_track(thick, along, power, 1.0f, random));
+        for (const Track& found :
+             follow(Estimator::transmittance, along(thick, way, 1.0f, power), 100000, 17)) {
+            values.push_back(found.weight);
         }
         const auto [mean, error] = test::estimate(values);
         EXPECT_NEAR(mean, std::exp(-power * tau), test::z_limit(0.9999, tests()) * error);
@@ -152,13 +177,56 @@ TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
 }
 
 TEST_F(TrackingTest, AMediumWithoutExtinctionIsNoObstacle) {
-    // A flight of no length through it is the one in 2^24 that could find no end.
     const Medium clear(*volume_, 0.0f, Color(1.0f), 0.0f);
-    Random random(1);
-    for (const LocalRay& along : rays_) {
-        EXPECT_FALSE(delta_track(clear, along, 0.0f, random));
-        EXPECT_EQ(ratio_track(clear, along, 1.0f, 1.0f, random), 1.0f);
-        EXPECT_EQ(ratio_track(*medium_, along, 1e-45f, 1.0f, random), 1.0f);
+    for (const LocalRay& way : rays_) {
+        // A flight of no length through it is the one in 2^24 that could find no end.
+        Track flight = along(clear, way), light = flight,
+              faint = along(*medium_, way, 1.0f, 1e-45f), none = along(*medium_, way, 1.0f, 0.0f);
+        faint.first = 0.5f;
+        Tracker tracker(volume_->tree());
+        tracker.add(Estimator::collision, flight);
+        for (Track* const track : {&light, &faint, &none})
+            tracker.add(Estimator::transmittance, *track);
+        tracker.run();
+        EXPECT_EQ(flight.distance, Track::none);
+        EXPECT_EQ(light.weight, 1.0f);
+        EXPECT_EQ(faint.weight, 1.0f);
+        EXPECT_EQ(none.weight, 1.0f);
+    }
+}
+
+TEST_F(TrackingTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
+    // Five media, so that no two neighbouring lanes have the same work.
+    std::vector<Medium> media;
+    for (int i = 0; i < 5; ++i)
+        media.emplace_back(*volume_, std::pow(4.0f, float(i) - 1.0f), Color(1.0f), 0.0f);
+    for (const Estimator estimator :
+         {Estimator::collision, Estimator::forced_collision, Estimator::transmittance}) {
+        std::vector<Track> tracks;
+        for (std::size_t i = 0; i < 3000; ++i) {
+            const LocalRay& way = rays_[i % rays_.size()];
+            tracks.push_back(along(media[i % media.size()], way, i % 3 == 0 ? 2.0f : 1.0f));
+            tracks.back().random = Random(hash_key(7, i));
+            tracks.back().first = unit_float(static_cast<std::uint32_t>(mix64(i)));
+        }
+        std::vector<Track> alone = tracks;
+        for (Track& track : alone) {
+            Tracker tracker(volume_->tree(), 4);
+            tracker.add(estimator, track);
+            tracker.run();
+        }
+        for (const int width : Tracker::widths()) {
+            std::vector<Track> together = tracks;
+            Tracker tracker(volume_->tree(), width);
+            for (Track& track : together) tracker.add(estimator, track);
+            tracker.run();
+            for (std::size_t i = 0; i < tracks.size(); ++i) {
+                ASSERT_EQ(together[i].distance, alone[i].distance)
+                    << width << " lanes, track " << i;
+                ASSERT_EQ(together[i].weight, alone[i].weight) << width << " lanes, track " << i;
+                ASSERT_EQ(together[i].random.state(), alone[i].random.state());
+            }
+        }
     }
 }
 

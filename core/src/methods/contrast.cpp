@@ -16,11 +16,15 @@ class Contrast final : public Method {
           schedule_(scene.medium),
           light_(scene, schedule_, transport.looks, Flights::other) {}
 
-    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+    Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
+               PathKit& kit) override {
         Random walk = random.stream(walk_stream);
-        if (const auto event = first_event(scene_, ray, random, walk, march_, record)) {
-            light_.add(*event, 0, octaves_, random, record);
-        }
+        const auto event = first_event(scene_, ray, random, walk, march_, record);
+        if (!event) co_return;
+        light_.ask(*event, 0, octaves_, random, kit.shadows);
+        kit.shadows.cast(kit.tracker);
+        co_await tracked;
+        kit.shadows.settle(record);
     }
 
   private:

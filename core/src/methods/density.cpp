@@ -16,17 +16,19 @@ class Density final : public Method {
           schedule_(scene.medium),
           light_(scene, schedule_, transport.looks, Flights::other) {}
 
-    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+    Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
+               PathKit& kit) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
         const auto event = first_event(scene_, ray, random, walk, march_, record);
-        if (!event) return;
-        walk_on(medium, *event, orders_, light_, random, walk, record,
-                [&](const LocalRay& onward, float u) -> std::optional<NextEvent> {
-                    march_.march(medium, onward, walk.uniform());
-                    if (march_.opacity() <= 0.0f) return std::nullopt;
-                    return NextEvent{onward.at(march_.invert(u)), march_.opacity()};
-                });
+        if (!event) return {};
+        return walk_on(
+            medium, *event, orders_, light_, random, walk, record, kit,
+            [this](const LocalRay& onward, float u, Random& numbers) -> std::optional<NextEvent> {
+                march_.march(scene_.medium, onward, numbers.uniform());
+                if (march_.opacity() <= 0.0f) return std::nullopt;
+                return NextEvent{onward.at(march_.invert(u)), march_.opacity()};
+            });
     }
 
   private:

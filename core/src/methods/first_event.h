@@ -4,6 +4,7 @@
 
 #include "../march.h"
 #include "../path.h"
+#include "../scene.h"
 
 #include <optional>
 

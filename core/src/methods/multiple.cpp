@@ -7,7 +7,6 @@
 // direction and goes on by exact delta tracking to its next event. Where d is tiny but not 0 the
 // walk leaps, to the letter; that is the method's bias. A step out of the volume that meets nothing
 // more ends the path.
-#include "../tracking.h"
 #include "first_event.h"
 #include "methods.h"
 #include "walk.h"
@@ -24,27 +23,23 @@ class Multiple final : public Method {
           schedule_(scene.medium),
           light_(scene, schedule_, transport.looks, Flights::other) {}
 
-    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+    Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
+               PathKit& kit) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
         const auto event = first_event(scene_, ray, random, walk, march_, record);
-        if (!event) return;
-        float local = medium.extinction(event->position);
-        walk_on(medium, *event, orders_, light_, random, walk, record,
-                [&](LocalRay step, float u) -> std::optional<NextEvent> {
-                    if (local > 0.0f) {
-                        step.origin = step.at(exponential(u) / local);
-                        if (!medium.inside(step.origin)) return std::nullopt;
-                        local = medium.extinction(step.origin);
-                    }
-                    if (local == 0.0f) {
-                        const auto distance = delta_track(medium, step, walk.exponential(), walk);
-                        if (!distance) return std::nullopt;
-                        step.origin = step.at(*distance);
-                        local = medium.extinction(step.origin);
-                    }
-                    return NextEvent{step.origin, 1.0f};
-                });
+        if (!event) return {};
+        return walk_on(medium, *event, orders_, light_, random, walk, record, kit,
+                       [&medium, local = 0.0f](LocalRay step, float u,
+                                               Random&) mutable -> std::optional<NextEvent> {
+                           if (local == 0.0f) local = medium.extinction(step.origin);
+                           if (local > 0.0f) {
+                               step.origin = step.at(exponential(u) / local);
+                               if (!medium.inside(step.origin)) return std::nullopt;
+                               local = medium.extinction(step.origin);
+                           }
+                           return NextEvent{step.origin, 1.0f, local == 0.0f};
+                       });
     }
 
   private:

@@ -3,7 +3,6 @@
 // made small. In the medium itself (`reference`) it is unbiased, the truth for the other methods;
 // in media reduced after the first events (`similarity`) it needs far fewer events, for a small
 // bias.
-#include "../tracking.h"
 #include "methods.h"
 
 #include <algorithm>
@@ -23,41 +22,69 @@ class Tracked final : public Method {
           first_rate_(first_rate(scene)),
           light_(scene, schedule_, transport.looks, Flights::tracked) {}
 
-    void trace(const CameraRay& ray, const PathRandom& random, PathRecord& record) override {
+    Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
+               PathKit& kit) override {
+        auto& [tracker, shadows, bridges] = kit;
         Random walk = random.stream(walk_stream);
-        const auto [opacity, depth] = forced_track(scene_.medium, *ray.volume, first_rate_,
-                                                   exponential(random.first[2]), walk);
-        if (opacity == 0.0f) return;
+        Track camera{.medium = &scene_.medium,
+                     .ray = *ray.volume,
+                     .random = walk,
+                     .first = random.first[2],
+                     .rate = first_rate_};
+        tracker.add(Estimator::forced_collision, camera);
+        co_await tracked;
+        walk = camera.random;
+        const float opacity = seldom(camera.weight, walk);
+        if (opacity == 0.0f) co_return;
         record.opacity = opacity;
-        record.depth = (ray.entry_distance + depth) * ray.depth_per_distance;
-        ScatterEvent event{ray.volume->at(depth), ray.direction, scene_.medium.albedo() * opacity};
+        record.depth = (ray.entry_distance + camera.distance) * ray.depth_per_distance;
+        ScatterEvent event{ray.volume->at(camera.distance), ray.direction,
+                           scene_.medium.albedo() * opacity};
         for (int n = 0;; ++n) {
-            light_.add(event, n, n + 1, random, record);
-            light_.add_bridges(event, n, events_, random, record);
+            light_.ask(event, n, n + 1, random, shadows);
+            light_.ask_bridges(event, n, events_, random, bridges);
             const auto [u1, u2, u3] = random.onward(n, walk);
             const HenyeyGreenstein& phase = schedule_.at(n).phase();
             const V3f direction = phase.sample(event.direction, u1, u2);
             const float inverse_density = phase.inverse_density(event.direction, direction);
             const Medium& medium = schedule_.onward(n);
-            const LocalRay flight = medium.ray(event.position, direction);
-            const auto distance = delta_track(medium, flight, exponential(u3), walk);
-            if (!distance) {
+            Track flight{.medium = &medium,
+                         .ray = medium.ray(event.position, direction),
+                         .random = walk,
+                         .first = u3};
+            tracker.add(Estimator::collision, flight);
+            do {
+                shadows.cast(tracker);
+                bridges.cast(tracker);
+                co_await tracked;
+                shadows.settle(record);
+                light_.go_on(bridges, shadows);
+            } while (!shadows.empty() || !bridges.empty());
+            if (flight.distance == Track::none) {
                 light_.add_escape(event, direction, inverse_density, n, record);
-                return;
+                co_return;
             }
             if (n + 1 == events_) {
                 record.bounded = bounded_;
-                return;
+                co_return;
             }
-            event.position = flight.at(*distance);
+            walk = flight.random;
+            event.position = flight.ray.at(flight.distance);
             event.direction = direction;
             event.weight *= medium.albedo();
             event.choices.add(inverse_density);
-            if (!survives(event.weight, opacity, walk)) return;
+            if (!survives(event.weight, opacity, walk)) co_return;
         }
     }
 
   private:
+    /// Makes a first collision of little chance a seldom one of more.
+    static float seldom(float chance, Random& random) {
+        constexpr float least = 0.01f;
+        if (chance >= least) return chance;
+        return random.uniform() * least < chance ? least : 0.0f;
+    }
+
     /// Russian roulette on weights that absorption has made small beside a path's first; a path
     /// without absorption is never ended.
     static bool survives(Color& weight, float first, Random& random) {

@@ -2,7 +2,7 @@
 // the next event is found.
 #pragma once
 
-#include "../path.h"
+#include "../method.h"
 
 #include <optional>
 
@@ -10,26 +10,42 @@ namespace pileus {
 
 struct NextEvent {
     V3f position;
-    float weight;  // the probability that there is one, where it is not sampled; otherwise 1
+    float weight;         // the probability that there is one, where it is not sampled; otherwise 1
+    bool vacuum = false;  // there is nothing here: the walk goes on by delta tracking
 };
 
 /// Gathers direct light at the event and at those that follow, at most `orders` of them.
-/// `next(LocalRay, u) -> std::optional<NextEvent>` finds the next event of a ray from the last by a
-/// number u in [0, 1); a path ends where there is none.
+/// `next(LocalRay, u, Random&) -> std::optional<NextEvent>` finds the next event of a ray from the
+/// last by a number u in [0, 1); a path ends where there is none.
 template <typename Next>
-void walk_on(const Medium& medium, ScatterEvent event, int orders, DirectLight& light,
-             const PathRandom& random, Random& walk, PathRecord& record, const Next& next) {
+Path walk_on(const Medium& medium, ScatterEvent event, int orders, const DirectLight& light,
+             const PathRandom& random, Random walk, PathRecord& record, PathKit& kit, Next next) {
     for (int order = 0;; ++order) {
-        light.add(event, order, order + 1, random, record);
-        if (order + 1 == orders) return;
+        light.ask(event, order, order + 1, random, kit.shadows);
+        kit.shadows.cast(kit.tracker);
+        co_await tracked;
+        kit.shadows.settle(record);
+        if (order + 1 == orders) co_return;
         const auto [u1, u2, u3] = random.onward(order, walk);
         event.direction = medium.phase().sample(event.direction, u1, u2);
-        const std::optional<NextEvent> found =
-            next(medium.ray(event.position, event.direction), u3);
-        if (!found) return;
+        const LocalRay onward = medium.ray(event.position, event.direction);
+        const std::optional<NextEvent> found = next(onward, u3, walk);
+        if (!found) co_return;
         event.position = found->position;
+        if (found->vacuum) {
+            const float first = walk.uniform();
+            Track flight{.medium = &medium,
+                         .ray = {found->position, onward.direction},
+                         .random = walk,
+                         .first = first};
+            kit.tracker.add(Estimator::collision, flight);
+            co_await tracked;
+            if (flight.distance == Track::none) co_return;
+            walk = flight.random;
+            event.position = flight.ray.at(flight.distance);
+        }
         event.weight *= medium.albedo() * found->weight;
-        if (event.weight == Color(0.0f)) return;
+        if (event.weight == Color(0.0f)) co_return;
     }
 }
 

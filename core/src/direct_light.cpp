@@ -1,6 +1,4 @@
-#include "path.h"
-
-#include "tracking.h"
+#include "direct_light.h"
 
 #include <algorithm>
 #include <cmath>
@@ -31,33 +29,46 @@ class Lobe {
     bool mixed_;
 };
 
+}  // namespace
+
 /// The way from an event to a light, for one power of its transmittance after the other. Each power
 /// starts from the same random numbers, so a look does not notice the others.
-class Shadow {
+class ShadowRay {
   public:
-    Shadow(const Medium& medium, const V3f& position, const V3f& direction, float rate,
-           const Random& random)
-        : medium_(medium), ray_(medium.ray(position, direction)), rate_(rate), random_(random) {}
+    ShadowRay(ShadowRays& rays, const Medium& medium, const V3f& position, const V3f& direction,
+              float rate, Random random)
+        : rays_(rays),
+          track_{.medium = &medium,
+                 .ray = medium.ray(position, direction),
+                 .random = random,
+                 .first = 0.0f,
+                 .rate = rate} {
+        track_.first = track_.random.uniform();
+    }
 
-    float transmittance(float power) {
-        if (power == power_) return transmittance_;
-        power_ = power;
-        Random random = random_;
-        return transmittance_ = ratio_track(medium_, ray_, power, rate_, random);
+    /// Light for the record, less what is lost on the way.
+    void carry(std::size_t look, int order, float power, const Color& radiance) {
+        if (power != power_) {
+            power_ = track_.power = power;
+            rays_.rays_.push_back(track_);
+        }
+        rays_.lights_.push_back({rays_.rays_.size() - 1, look, order, radiance});
     }
 
   private:
-    const Medium& medium_;
-    LocalRay ray_;
-    float rate_;
-    Random random_;
-    float power_ = 0.0f, transmittance_ = 1.0f;
+    ShadowRays& rays_;
+    Track track_;
+    float power_ = -1.0f;  // of the ray that was laid down last
 };
+
+namespace {
 
 /// The chance with which light is asked for that would count `brightness` times as much as it does
 /// under an isotropic phase function: most directions lie far off the phase function's peak. b has
 /// no say, so that it can be regraded.
-float chance(float brightness) { return std::min(1.0f, brightness); }
+float chance(float brightness, bool early) {
+    return std::min(1.0f, (early ? 1.5f : 1.0f) * brightness);
+}
 
 }  // namespace
 
@@ -69,31 +80,27 @@ DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
       tracked_(flights == Flights::tracked),
       all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
                                         [](const Look& look) { return look.physical(); })),
-      reach_(tracked_ ? bridge_length(scene.medium.phase().g()) : 0),
-      chains_(scene.lights.size()) {}
-
-void DirectLight::set_terms(int first, int last) {
-    if (first == first_ && last == last_) return;
-    first_ = first;
-    last_ = last;
-    terms_.clear();
-    for (std::size_t k = 0; k < looks_.size(); ++k) {
-        for (int i = first; i < last; ++i) {
-            const Look& look = looks_[k];
-            const int order = schedule_.order(i);
-            const auto power = [order](float base) {
-                return base == 1.0f ? 1.0f : std::pow(base, static_cast<float>(order));
-            };
-            terms_.push_back({k, order, power(look.b),
-                              HenyeyGreenstein(power(look.c) * schedule_.at(i).phase().g()),
-                              power(look.a), tracked_ && look.physical()});
-        }
+      reach_(tracked_ ? bridge_length(scene.medium.phase().g()) : 0) {
+    constexpr int kept = 64;
+    for (int n = 0; n < kept; ++n) {
+        for (std::size_t look = 0; look < looks.size(); ++look)
+            terms_.push_back(make_term(look, n));
     }
 }
 
-void DirectLight::add(const ScatterEvent& event, int first, int last, const PathRandom& random,
-                      PathRecord& record) {
-    set_terms(first, last);
+DirectLight::Term DirectLight::make_term(std::size_t look, int n) const {
+    const Look& given = looks_[look];
+    const int order = schedule_.order(n);
+    const auto power = [order](float base) {
+        return base == 1.0f ? 1.0f : std::pow(base, static_cast<float>(order));
+    };
+    return {look,           order,
+            power(given.b), HenyeyGreenstein(power(given.c) * schedule_.at(n).phase().g()),
+            power(given.a), tracked_ && given.physical()};
+}
+
+void DirectLight::ask(const ScatterEvent& event, int first, int last, const PathRandom& random,
+                      ShadowRays& rays) const {
     const HenyeyGreenstein& phase = schedule_.at(first).phase();
     const Medium& onward = schedule_.onward(first);
     const Lobe lobe(phase, last > 1);
@@ -101,7 +108,9 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
     const float roulette = first == 0 ? 0.0f : event_stream.uniform();
     // A path has one first event and many later ones, so there noise counts more and time less.
     const float rate = first == 0 ? 2.0f : 1.0f;
-    const auto asked = [&](float brightness) { return first == 0 ? 1.0f : chance(brightness); };
+    const auto asked = [&](float brightness) {
+        return first == 0 ? 1.0f : chance(brightness, early(first));
+    };
 
     for (const auto& light : scene_.lights) {
         Random stream(event_stream.bits());
@@ -117,19 +126,18 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
             if (!hit && bridged(first)) {
                 others = event.choices.inverse(reach_);
             }
-            Shadow shadow(onward, event.position, sample->direction, rate, stream);
-            for (const Term& term : terms_) {
+            ShadowRay ray(rays, onward, event.position, sample->direction, rate, stream);
+            for_terms(first, last, [&](const Term& term) {
                 const float rival = hit ? (term.walk ? seen : lobe_density) : 0.0f;
                 const float share = rival > 0.0f ? sample->density / (sample->density + rival)
                                                  : 1.0f / (1.0f + seen * others);
                 const float scattered =
                     share * term.phase.density(event.direction, sample->direction);
                 const float odds = asked(4.0f * pi * scattered);
-                if (roulette >= odds) continue;
-                record.add(term.look, term.order,
-                           event.weight * sample->radiance *
-                               (term.weight * scattered / odds * shadow.transmittance(term.power)));
-            }
+                if (roulette >= odds) return;
+                ray.carry(term.look, term.order, term.power,
+                          event.weight * sample->radiance * (term.weight * scattered / odds));
+            });
         }
         // ... and the phase function's, weighed against each other by the balance heuristic (Veach
         // 1997).
@@ -142,85 +150,101 @@ void DirectLight::add(const ScatterEvent& event, int first, int last, const Path
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        Shadow shadow(onward, event.position, direction, rate, lobe_stream);
-        for (const Term& term : terms_) {
-            if (term.walk) continue;
+        ShadowRay ray(rays, onward, event.position, direction, rate, lobe_stream);
+        for_terms(first, last, [&](const Term& term) {
+            if (term.walk) return;
             const float scattered = term.phase.density(event.direction, direction) / density;
             const float odds = asked(scattered);
-            if (roulette >= odds) continue;
-            record.add(term.look, term.order,
-                       event.weight * radiance *
-                           (term.weight * scattered / odds * shadow.transmittance(term.power)));
-        }
+            if (roulette >= odds) return;
+            ray.carry(term.look, term.order, term.power,
+                      event.weight * radiance * (term.weight * scattered / odds));
+        });
     }
 }
 
-void DirectLight::add_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
-                              PathRecord& record) {
+void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
+                              Bridges& bridges) const {
     if (n + 1 >= end || !bridged(n + 1)) return;
     const HenyeyGreenstein& phase = schedule_.at(n).phase();
     Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(n));
     for (std::size_t k = 0; k < scene_.lights.size(); ++k) {
         if (scene_.lights[k]->can_be_hit()) continue;
-        const std::optional<Chain>& way = chain(k, n, random);
+        const std::optional<Chain>& way = chain(bridges, k, n, random);
         if (!way) continue;
-        const LightSample& light = way->light();
         for (int length = 1; length <= reach_ && n + length < end && bridged(n + length);
              ++length) {
             // Of all choices of which a bridge leaves one to be evaluated.
             const float inverse = way->inverse(length) +
                                   phase.inverse_density(event.direction, way->first(length)) +
                                   event.choices.inverse(reach_ - length);
-            const float brightness = (n == 0 ? 4.0f : 2.0f) * pi / inverse;
-            if (event_stream.uniform() >= chance(brightness)) continue;
-            Random own(event_stream.bits());
-            const auto arrival = fly(event, n, way->directions(length), own);
-            if (!arrival) continue;
-            set_terms(n + length, n + length + 1);
-            Shadow shadow(schedule_.onward(n + length), arrival->position, light.direction, 1.0f,
-                          own);
-            for (const Term& term : terms_) {
-                const float scattered =
-                    term.phase.density(way->first(1), light.direction) * way->inverse(1) / inverse;
-                record.add(term.look, term.order,
-                           arrival->weight * light.radiance *
-                               (term.weight * scattered / chance(brightness) *
-                                shadow.transmittance(term.power)));
-            }
+            const float odds = chance((n == 0 ? 4.0f : 2.0f) * pi / inverse, early(n));
+            if (event_stream.uniform() >= odds) continue;
+            bridges.under_way_.push_back(
+                {&*way, n, length, event.weight, inverse * odds,
+                 flight(event.position, way->first(length), n, Random(event_stream.bits()))});
         }
     }
 }
 
 /// The bridges' directions into a light. Neighbouring events share them: most bridges are not
 /// taken, and of such a one there is little to do but to draw its directions.
-const std::optional<Chain>& DirectLight::chain(std::size_t light, int n, const PathRandom& random) {
+const std::optional<Chain>& DirectLight::chain(Bridges& bridges, std::size_t light, int n,
+                                               const PathRandom& random) const {
     constexpr int sharing = 4;
+    std::optional<Chain>& chain = bridges.chains_[light];
     if (n % sharing == 0) {
-        Random stream =
-            random.stream(chain_stream, static_cast<std::uint64_t>(n) * chains_.size() + light);
+        Random stream = random.stream(chain_stream,
+                                      static_cast<std::uint64_t>(n) * scene_.lights.size() + light);
         const float u1 = stream.uniform(), u2 = stream.uniform();
         const auto sample = scene_.lights[light]->sample(u1, u2);
-        chains_[light] =
-            sample ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, stream))
-                   : std::nullopt;
+        chain = sample ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, stream))
+                       : std::nullopt;
     }
-    return chains_[light];
+    return chain;
 }
 
-/// Where a path comes to that flies on from event n along the directions of a chain, its last
-/// first; nothing if it leaves the medium on its way.
-std::optional<ScatterEvent> DirectLight::fly(const ScatterEvent& from, int n,
-                                             std::span<const V3f> chain, Random& random) const {
-    ScatterEvent event = from;
-    for (auto direction = chain.rbegin(); direction != chain.rend(); ++direction) {
-        const Medium& medium = schedule_.onward(n++);
-        const LocalRay flight = medium.ray(event.position, *direction);
-        const auto distance = delta_track(medium, flight, random.exponential(), random);
-        if (!distance) return std::nullopt;
-        event.position = flight.at(*distance);
-        event.weight *= medium.albedo();
+/// A bridge's flight from event n.
+Track DirectLight::flight(const V3f& position, const V3f& direction, int n, Random random) const {
+    const Medium& medium = schedule_.onward(n);
+    const float first = random.uniform();
+    return {.medium = &medium,
+            .ray = medium.ray(position, direction),
+            .random = random,
+            .first = first};
+}
+
+void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
+    auto kept = bridges.under_way_.begin();
+    for (Bridges::Bridge& bridge : bridges.under_way_) {
+        Track& flown = bridge.flight;
+        if (flown.distance == Track::none) continue;
+        const V3f position = flown.ray.at(flown.distance);
+        bridge.weight *= flown.medium->albedo();
+        const int n = ++bridge.n;
+        if (--bridge.left > 0) {
+            flown = flight(position, bridge.chain->first(bridge.left), n, flown.random);
+            *kept++ = bridge;
+            continue;
+        }
+        const LightSample& light = bridge.chain->light();
+        const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
+        ShadowRay ray(rays, schedule_.onward(n), position, light.direction, early(n) ? 2.0f : 1.0f,
+                      flown.random);
+        for_terms(n, n + 1, [&](const Term& term) {
+            const float scattered =
+                term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
+            ray.carry(term.look, term.order, term.power,
+                      bridge.weight * light.radiance * (term.weight * scattered));
+        });
     }
-    return event;
+    bridges.under_way_.erase(kept, bridges.under_way_.end());
+}
+
+/// Whether event n comes before a walk has lost its direction, four transport mean free paths along
+/// it: what those events see of the light differs from pixel to pixel the most, and is worth more
+/// work.
+bool DirectLight::early(int n) const {
+    return static_cast<float>(n) * (1.0f - scene_.medium.phase().g()) < 4.0f;
 }
 
 /// Whether light of event n's order also comes by bridges: where its lobe, and so those of the

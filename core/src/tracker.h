@@ -1,0 +1,71 @@
+// Tracking: along each ray a Poisson process of tentative collisions under the local majorants
+// (Woodcock et al. 1965; Novak et al. 2018). One routine serves distance sampling, collisions that
+// are made to happen and transmittance alike, and follows many rays at once, a ray a lane.
+#pragma once
+
+#include "medium.h"
+#include "random.h"
+
+#include <array>
+#include <limits>
+#include <span>
+#include <vector>
+
+namespace pileus {
+
+enum class Estimator {
+    /// Delta tracking: the distance to the next true collision, distributed as transmittance times
+    /// extinction.
+    collision,
+    /// Weighted delta tracking (Novak et al. 2018): at each tentative collision a part of the
+    /// weight collides and the rest goes on. One of the collisions is kept, drawn by its part.
+    /// Light and opacity where the medium is thin are then no longer a matter of all or nothing.
+    /// When little is left it goes on as in delta tracking, all of it at once.
+    forced_collision,
+    /// Ratio tracking (Novak et al. 2014): an unbiased estimate of T^power, for power in [0, 1].
+    /// The power scales the extinction inside the estimator, for E[T^a] is not E[T]^a, and the
+    /// majorant with it: light that a look lets through easily is also cheap. Estimates below a
+    /// tenth live on with that chance.
+    transmittance,
+};
+
+/// A ray, and what tracking has found along it.
+struct Track {
+    static constexpr float none = std::numeric_limits<float>::infinity();
+
+    const Medium* medium;
+    LocalRay ray;
+    Random random;       // goes on where tracking has left it
+    float first;         // of which the first free flight is drawn, uniform in [0, 1)
+    float power = 1.0f;  // of the transmittance
+    float rate = 1.0f;   // of collisions, over the majorant; at least 1. More of them, less noise
+    float distance = none;  // of the collision; none where the ray leaves the medium
+    // Of a forced collision: an unbiased estimate of 1 - T, in [0, 1]. Of transmittance: that.
+    float weight = 0.0f;
+};
+
+/// Follows rays through media over one tree.
+class Tracker {
+  public:
+    /// How many rays at once this machine can follow, the most last.
+    static std::vector<int> widths();
+
+    /// `width` is one of `widths`.
+    explicit Tracker(const BrickTree& tree, int width = widths().back());
+
+    /// Lays down a ray, which must stay where it is until `run` has returned.
+    void add(Estimator estimator, Track& track) {
+        waiting_[static_cast<std::size_t>(estimator)].push_back(&track);
+    }
+
+    /// Follows all rays that were laid down. What is found along one does not depend on the others,
+    /// nor on the width.
+    void run();
+
+  private:
+    const BrickTree* tree_;
+    void (*follow_)(Estimator, const BrickTree&, std::span<Track* const>);
+    std::array<std::vector<Track*>, 3> waiting_;  // by estimator
+};
+
+}  // namespace pileus
