@@ -128,7 +128,7 @@ def chart(
         bars.append(refinement(pileus, fixed, plan.repeats, plan.scale, data))
         bars.extend(threads(pileus, fixed, plan.repeats, plan.scale, data))
         if CYCLES_DENOISED in contenders and find_spec("pyoidn") is not None:
-            denoised.extend(end_to_end(pileus, peers_python, plan.scale, data, shared))
+            denoised.extend(end_to_end(pileus, peers_python, data, shared))
             bars.append(denoised_bar(denoised))
         result = charted()
     if out is not None:

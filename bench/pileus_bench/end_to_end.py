@@ -34,9 +34,7 @@ TRUTH_NOISE, TRUTH_SECONDS = 0.02, 60.0
 Attempt = Callable[[int], tuple[Image, Spent]]
 
 
-def end_to_end(
-    renderer: RendererProcess, python: str, scale: float, data: Path, shared: Path
-) -> list[EndToEnd]:
+def end_to_end(renderer: RendererProcess, python: str, data: Path, shared: Path) -> list[EndToEnd]:
     """By scene, ours and the peer's at the first power of two that meets the target.
 
     `renderer` is Pileus, for the truths; `python` has the peer.
@@ -47,8 +45,7 @@ def end_to_end(
             scene = load_scene(name, 1.0, data, shared)
         except AbsentError:
             continue
-        sides = {"width": round(WIDTH * scale), "height": round(HEIGHT * scale)}
-        image = scene.shot.image.model_copy(update=sides)
+        image = scene.shot.image.model_copy(update={"width": WIDTH, "height": HEIGHT})
         scene = replace(scene, shot=scene.shot.model_copy(update={"image": image}))
         view = view_of(scene, scene.frames[0], data)
         renderer.load(view)

@@ -154,8 +154,8 @@ def _end_to_end(found: Sequence[EndToEnd]) -> list[str]:
         for each in found
     ]
     return [
-        "## Denoised, from a cache on disk to an image on disk\n\n960x540 in a full chart, half of "
-        "it in a small one. Pileus with its start, the peer without.\n",
+        "## Denoised, from a cache on disk to an image on disk\n\nAt 960x540. Pileus with its "
+        "start, the peer without.\n",
         _table(head, rows),
     ]
 
