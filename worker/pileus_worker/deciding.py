@@ -195,7 +195,8 @@ class Pilot:
         layers = np.stack([_planes(half, [*_ORDERS, ""]) for half in layered])
         images, cut_off = layers[:, :, -1].copy(), 0
         layers[:, :, -1] = 0.0  # what comes after the last order
-        if layers[:, :, -2].any():
+        # Deep in a closed medium no order of these brings light, and all of it comes later.
+        if layers[:, :, PILOT_ORDERS // 2 :].any() or not layers.any():
             whole = self._halves(samples)
             layers[:, :, -1] = [_planes(half, [""])[:, 0] for half in whole] - images
             images += layers[:, :, -1]
