@@ -3,7 +3,7 @@
 #pragma once
 
 #include "direct_light.h"
-#include "paths.h"
+#include "path_in_flight.h"
 
 #include <memory>
 #include <string>

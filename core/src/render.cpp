@@ -8,7 +8,6 @@
 #include <tbb/task_arena.h>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 
 namespace pileus {
@@ -88,6 +87,7 @@ struct Sample {
 /// What one thread traces with.
 struct Workspace {
     // Enough paths in flight that the tracker's lanes stay full, and few enough to lie in a cache.
+    // Fewer where an event may ask for very many looks and orders at once.
     static constexpr std::size_t in_flight = 256;
     // So many samples are traced before they are summed in their order: the more, the longer the
     // lanes stay full.
@@ -96,7 +96,12 @@ struct Workspace {
     Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
         : method(make_method(scene, transport)),
           tracker(std::make_unique<Tracker>(scene.volume->tree())),
-          kits(in_flight, PathKit(*tracker, scene.lights.size())),
+          kits(std::clamp<std::size_t>(
+                   (std::size_t{1} << 16) /
+                       (transport.looks.size() *
+                        static_cast<std::size_t>(transport.max_bounces.value_or(1))),
+                   1, in_flight),
+               PathKit(*tracker, scene.lights.size())),
           blank(transport.looks.size(), orders),
           sums(transport.looks.size(), orders, keep_orders),
           most(std::clamp<std::size_t>(
@@ -105,7 +110,7 @@ struct Workspace {
 
     std::unique_ptr<Method> method;
     std::unique_ptr<Tracker> tracker;
-    std::vector<PathKit> kits;
+    std::vector<PathKit> kits;  // one for each path in flight
     std::vector<Sample> samples;
     std::vector<PathRecord> records;  // as many as there were samples
     PathRecord blank;
@@ -117,7 +122,7 @@ struct Workspace {
 void trace(Workspace& work, const Scene& scene, const Control& control) {
     if (work.records.size() < work.samples.size())
         work.records.resize(work.samples.size(), work.blank);
-    std::array<Path, Workspace::in_flight> paths;
+    std::vector<Path> paths(work.kits.size());
     std::size_t next = 0;
     const auto goes_on = [&](std::size_t slot) {
         while (!paths[slot].resume()) {
