@@ -115,9 +115,8 @@ def test_a_grid_needs_memory_for_what_it_stores_not_for_where(tmp_path: Path) ->
     assert far.bytes - near.bytes < 1024 + 4096 * 8 * 2 * levels
 
 
-def test_an_image_needs_memory_for_its_pixels() -> None:
-    """4 bytes a pixel, look and channel: the formula of docs/stability.md, in a process alone."""
-    width, height, looks, channels = 16384, 96, 4, 8
+def added(hazard: str, size: tuple[int, int], rendered: str) -> int:
+    """Bytes that a render adds at most to what is held before it, in a process alone."""
     program = f"""
 import re, tempfile
 from pathlib import Path
@@ -127,12 +126,11 @@ from dataclasses import replace
 from pileus_service.shot import Look
 def memory(name):  # bytes; getrusage's maximum would be that of the parent at first
     return 1024 * int(re.search(name + ":\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
-hazard = replace(next(h for h in HAZARDS if h.name == "wide bucket"), size=({width}, {height}))
+hazard = replace(next(h for h in HAZARDS if h.name == "{hazard}"), size={size})
 with tempfile.TemporaryDirectory() as folder:
     stage = Stage.of(hazard, Path(folder), SMALL)
-    looks = [Look(name=f"look{{i}}") for i in range({looks})]
     held = memory("VmRSS")
-    partial = stage.render("single", (0, 1), looks=looks, lights=[])
+    partial = stage.render({rendered})
     print(memory("VmHWM") - held)
 """
     ended = subprocess.run(
@@ -143,8 +141,24 @@ with tempfile.TemporaryDirectory() as folder:
         text=True,
         check=True,
     )
-    formula = 4 * width * height * looks * channels
-    assert int(ended.stdout) == pytest.approx(formula, abs=24e6)
+    return int(ended.stdout)
+
+
+def test_an_image_needs_memory_for_its_pixels() -> None:
+    """4 bytes a pixel, look and channel: the formula of docs/stability.md."""
+    width, height, looks, channels = 16384, 96, 4, 8
+    named = f'[Look(name=f"look{{i}}") for i in range({looks})]'
+    held = added("wide bucket", (width, height), f'"single", (0, 1), looks={named}, lights=[]')
+    assert held == pytest.approx(4 * width * height * looks * channels, abs=24e6)
+
+
+def test_rays_in_flight_need_bounded_memory() -> None:
+    """600 bytes for each light, look and order: the formula of docs/stability.md. A path in flight
+    holds a shadow ray for each; 256 of them at once would hold gigabytes."""
+    octaves = 1 << 16
+    look = '[Look(name="look", a=0.999, b=0.9, c=0.9)]'
+    held = added("looks", (8, 6), f'"contrast", (0, 4), looks={look}, max_bounces={octaves}')
+    assert held < 2 * 600 * octaves
 
 
 def refused(what: str, call: Any) -> None:
