@@ -100,9 +100,9 @@ def test_a_redis_of_an_earlier_hour_is_put_right(cached_shot: Shot, tmp_path: Pa
         farm.client.control(gone, "cancel")
         httpx.delete(f"http://{farm.listen}/v1/jobs/{dropped}").raise_for_status()
         farm.client.control(late, "resume")
-        assert ended(farm, early).state == "done"
         until(lambda: len(parts(farm, late)) > 3)
         farm.client.control(late, "pause")
+        assert ended(farm, early).state == "done"
         until(lambda: not busy(farm))
         written = {path: path.stat().st_mtime_ns for path in tmp_path.glob("out/*.exr")}
         before = parts(farm, late)
