@@ -85,19 +85,13 @@ def finish(client: Client, job: str) -> JobView:
 
 
 def test_the_farms_frames_equal_those_of_pileus_render(
-    real_shot: Shot, tmp_path: Path, caches: Path
+    client: Client, real_shot: Shot, tmp_path: Path
 ) -> None:
-    # Tasks so short that any machine cuts its frames into buckets and sample ranges.
-    with (
-        embedded_farm(tmp_path / "farm", [tmp_path, caches], 2, "127.0.0.1:0", 0.001) as farm,
-        Client(farm.url) as client,
-    ):
-        job = client.submit(real_shot).job.id
-        finish(client, job)
-        assert [frame.state for frame in client.frames(job)] == ["done"] * 3
-    parts = plan_of(tmp_path / "farm", job, 2).parts
-    assert len({part.bucket for part in parts}) > 1
-    assert any(part.samples[0] > 0 for part in parts)
+    job = client.submit(real_shot).job.id
+    view = finish(client, job)
+    assert view.frames_done == 3
+    assert len({part.bucket for part in plan_of(tmp_path / "farm", job, 2).parts}) > 1
+    assert any(part.samples[0] > 0 for part in plan_of(tmp_path / "farm", job, 2).parts)
     file = tmp_path / "shot.json"
     file.write_text(real_shot.model_dump_json())
     command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
@@ -106,9 +100,10 @@ def test_the_farms_frames_equal_those_of_pileus_render(
     assert [report["frame"] for report in reports] == [1, 2, 3]
     for report in reports:
         same_bits(real_shot, tmp_path / "farm", job, report["frame"], tmp_path)
-        merged = pixels(real_shot.output(report["frame"]))
+        farm = pixels(real_shot.output(report["frame"]))
         for name, values in pixels(Path(report["file"])).items():
-            np.testing.assert_allclose(merged[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+            np.testing.assert_allclose(farm[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+    assert [frame.state for frame in client.frames(job)] == ["done"] * 3
     preview = Store(tmp_path / "farm").frame(job, 1).preview
     assert preview.read_bytes().startswith(b"\x89PNG")
 
@@ -217,6 +212,22 @@ def test_a_damaged_partial_is_rendered_again(
     client.control(job, "resume")
     finish(client, job)
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
+
+
+def test_a_cancelled_render_stops_within_two_seconds(client: Client, real_shot: Shot) -> None:
+    endless = real_shot.model_copy(
+        update={"sampling": real_shot.sampling.model_copy(update={"samples": 1 << 18})}
+    )
+    job = client.submit(endless).job.id
+    end = time.monotonic() + 30
+    while not any(worker.task and worker.task.kind == "render" for worker in client.workers()):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    begun = time.monotonic()
+    client.control(job, "cancel")
+    while any(worker.task for worker in client.workers()):
+        assert time.monotonic() - begun < 2.0
+        time.sleep(0.05)
 
 
 def test_a_render_child_has_limits(farm: EmbeddedFarm, client: Client, real_shot: Shot) -> None:

@@ -48,26 +48,40 @@ class Chain {
         V3f next = light.direction;
         float sum = 0.0f;
         for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
-            const float u1 = random.uniform(), u2 = random.uniform();
-            direction_[i] = phase.sample(next, u1, u2);
-            sum += phase.inverse_density(direction_[i], next);
-            inverse_[i] = sum;
-            next = direction_[i];
+            const auto [u1, u2] = random.pair();
+            const auto [direction, inverse_density] = phase.sample(next, u1, u2);
+            for (int axis = 0; axis < 3; ++axis) direction_[axis][i] = direction[axis];
+            inverse_[i] = sum += inverse_density;
+            next = direction;
         }
     }
 
     const LightSample& light() const { return light_; }
 
     /// The direction in which a bridge with so many events leaves the walk.
-    const V3f& first(int events) const { return direction_[static_cast<std::size_t>(events - 1)]; }
+    V3f first(int events) const {
+        const auto i = static_cast<std::size_t>(events - 1);
+        return {direction_[0][i], direction_[1][i], direction_[2][i]};
+    }
 
     /// The inverse densities of its choices, summed.
     float inverse(int events) const { return inverse_[static_cast<std::size_t>(events - 1)]; }
 
+    /// The same and that of `first`, under the phase function of the event that the bridge leaves:
+    /// of bridges with 1, 2, ... events.
+    std::array<float, longest_bridge> inverses(const HenyeyGreenstein& phase,
+                                               const V3f& arriving) const {
+        std::array<float, longest_bridge> sums;
+        for (std::size_t i = 0; i < sums.size(); ++i) {
+            const V3f leaving(direction_[0][i], direction_[1][i], direction_[2][i]);
+            sums[i] = inverse_[i] + phase.inverse_density(arriving, leaving);
+        }
+        return sums;
+    }
+
   private:
     LightSample light_;
-    std::array<V3f, longest_bridge> direction_;
-    std::array<float, longest_bridge> inverse_{};
+    std::array<float, longest_bridge> direction_[3]{}, inverse_{};
 };
 
 }  // namespace pileus

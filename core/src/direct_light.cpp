@@ -16,7 +16,7 @@ class Lobe {
 
     V3f sample(const V3f& in, float choice, float u1, float u2) const {
         const bool sphere = mixed_ && choice < 0.5f;
-        return sphere ? HenyeyGreenstein(0.0f).sample(in, u1, u2) : phase_.sample(in, u1, u2);
+        return (sphere ? HenyeyGreenstein(0.0f) : phase_).sample(in, u1, u2).direction;
     }
 
     float density(const V3f& in, const V3f& out) const {
@@ -38,26 +38,35 @@ class ShadowRay {
     ShadowRay(ShadowRays& rays, const Medium& medium, const V3f& position, const V3f& direction,
               float rate, Random random)
         : rays_(rays),
-          track_{.medium = &medium,
-                 .ray = medium.ray(position, direction),
-                 .random = random,
-                 .first = 0.0f,
-                 .rate = rate} {
-        track_.first = track_.random.uniform();
-    }
+          medium_(medium),
+          position_(position),
+          direction_(direction),
+          rate_(rate),
+          first_(random.uniform()),
+          random_(random) {}
 
     /// Light for the record, less what is lost on the way.
     void carry(std::size_t look, int order, float power, const Color& radiance) {
         if (power != power_) {
-            power_ = track_.power = power;
-            rays_.rays_.push_back(track_);
+            power_ = power;
+            rays_.rays_.push_back({.medium = &medium_,
+                                   .ray = medium_.ray(position_, direction_),
+                                   .random = random_,
+                                   .first = first_,
+                                   .power = power,
+                                   .rate = rate_});
         }
         rays_.lights_.push_back({rays_.rays_.size() - 1, look, order, radiance});
     }
 
   private:
     ShadowRays& rays_;
-    Track track_;
+    const Medium& medium_;
+    const V3f& position_;
+    const V3f& direction_;
+    float rate_;
+    float first_;
+    Random random_;
     float power_ = -1.0f;  // of the ray that was laid down last
 };
 
@@ -116,8 +125,10 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
         Random stream(event_stream.bits());
         const bool hit = light->can_be_hit();
         // The light's own directions ...
-        const float u1 = first == 0 ? random.light()[0] : stream.uniform();
-        const float u2 = first == 0 ? random.light()[1] : stream.uniform();
+        const auto numbers = [&](Random& from) {
+            return first == 0 ? std::array{random.light()[0], random.light()[1]} : from.pair();
+        };
+        const auto [u1, u2] = numbers(stream);
         if (const auto sample = light->sample(u1, u2)) {
             const float seen = phase.density(event.direction, sample->direction);
             const float lobe_density =
@@ -132,7 +143,9 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
                 const float share = rival > 0.0f ? sample->density / (sample->density + rival)
                                                  : 1.0f / (1.0f + seen * others);
                 const float scattered =
-                    share * term.phase.density(event.direction, sample->direction);
+                    share * (term.phase.g() == phase.g()
+                                 ? seen
+                                 : term.phase.density(event.direction, sample->direction));
                 const float odds = asked(4.0f * pi * scattered);
                 if (roulette >= odds) return;
                 ray.carry(term.look, term.order, term.power,
@@ -144,8 +157,7 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
         if (!hit || all_walk_) continue;
         Random lobe_stream(stream.bits());
         const float choice = first == 0 ? random.first[3] : lobe_stream.uniform();
-        const float v1 = first == 0 ? random.light()[0] : lobe_stream.uniform();
-        const float v2 = first == 0 ? random.light()[1] : lobe_stream.uniform();
+        const auto [v1, v2] = numbers(lobe_stream);
         const V3f direction = lobe.sample(event.direction, choice, v1, v2);
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);
@@ -171,14 +183,18 @@ void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const P
         if (scene_.lights[k]->can_be_hit()) continue;
         const std::optional<Chain>& way = chain(bridges, k, n, random);
         if (!way) continue;
+        const auto inverses = way->inverses(phase, event.direction);
+        // Systematic sampling (Madow 1949): one number decides on all lengths.
+        float until_taken = event_stream.uniform();
         for (int length = 1; length <= reach_ && n + length < end && bridged(n + length);
              ++length) {
             // Of all choices of which a bridge leaves one to be evaluated.
-            const float inverse = way->inverse(length) +
-                                  phase.inverse_density(event.direction, way->first(length)) +
+            const float inverse = inverses[static_cast<std::size_t>(length - 1)] +
                                   event.choices.inverse(reach_ - length);
             const float odds = chance((n == 0 ? 4.0f : 2.0f) * pi / inverse, early(n));
-            if (event_stream.uniform() >= odds) continue;
+            until_taken -= odds;
+            if (until_taken >= 0.0f) continue;
+            until_taken += 1.0f;
             bridges.under_way_.push_back(
                 {&*way, n, length, event.weight, inverse * odds,
                  flight(event.position, way->first(length), n, Random(event_stream.bits()))});
@@ -195,7 +211,7 @@ const std::optional<Chain>& DirectLight::chain(Bridges& bridges, std::size_t lig
     if (n % sharing == 0) {
         Random stream = random.stream(chain_stream,
                                       static_cast<std::uint64_t>(n) * scene_.lights.size() + light);
-        const float u1 = stream.uniform(), u2 = stream.uniform();
+        const auto [u1, u2] = stream.pair();
         const auto sample = scene_.lights[light]->sample(u1, u2);
         chain = sample ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, stream))
                        : std::nullopt;

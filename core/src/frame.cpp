@@ -60,7 +60,7 @@ void Frame::add(const Partial& partial) {
         throw InputError(text(window) + ", " + text(partial.samples) +
                          " is of another frame (identity, looks or orders differ)");
     }
-    const int reached = tile->reached;
+    const int reached = tile->partial.samples.last;
     const int wanted = tile->wanted.value_or(partial.samples.last);
     if (partial.samples.count() < 1 || partial.samples.first != reached ||
         partial.samples.last > wanted) {
@@ -70,25 +70,20 @@ void Frame::add(const Partial& partial) {
     }
     tile->wanted = wanted;
     bounded_paths_ += partial.bounded_paths;
-    tile->reached = partial.samples.last;
-    std::vector<Partial>& runs = tile->runs;
-    runs.push_back(partial);
-    const bool whole = tile->reached == wanted;
-    while (runs.size() > 1) {
-        Partial& before = runs.rbegin()[1];
-        if (!whole && before.samples.count() >= 2 * runs.back().samples.count()) break;
-        before.pool(runs.back());
-        runs.pop_back();
+    if (reached == 0) {
+        tile->partial = partial;
+    } else {
+        tile->partial.pool(partial);
     }
-    if (whole) {
-        tile->error = runs.front().relative_error();
+    if (tile->partial.samples.last == tile->wanted) {
+        tile->error = tile->partial.relative_error();
         place(*tile);
-        runs.clear();
+        tile->partial.image = {};
     }
 }
 
 void Frame::place(const Tile& tile) {
-    const LayeredImage& source = tile.runs.front().image;
+    const LayeredImage& source = tile.partial.image;
     const Bucket& window = tile.bucket;
     for (std::size_t look = 0; look < source.looks().size(); ++look) {
         for (std::size_t c = 0; c < source.channels().size(); ++c) {
@@ -104,7 +99,7 @@ void Frame::place(const Tile& tile) {
 double Frame::mean_samples() const {
     double samples = 0.0, pixels = 0.0;
     for (const Tile& tile : tiles_) {
-        if (!tile.wanted || tile.reached != tile.wanted) continue;
+        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
         const auto area = static_cast<double>(tile.bucket.pixels());
         samples += *tile.wanted * area;
         pixels += area;
@@ -115,7 +110,7 @@ double Frame::mean_samples() const {
 double Frame::relative_error() const {
     double squares = 0.0, pixels = 0.0;
     for (const Tile& tile : tiles_) {
-        if (!tile.wanted || tile.reached != tile.wanted) continue;
+        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
         const auto area = static_cast<double>(tile.bucket.pixels());
         squares += tile.error * tile.error * area;
         pixels += area;
@@ -126,10 +121,10 @@ double Frame::relative_error() const {
 void Frame::require_complete() const {
     for (const Tile& tile : tiles_) {
         if (!tile.wanted) throw InputError(text(tile.bucket) + " has no samples; render it");
-        if (tile.reached == tile.wanted) continue;
-        throw InputError(text(tile.bucket) + " has " + std::to_string(tile.reached) + " of its " +
-                         std::to_string(*tile.wanted) + " samples; render " +
-                         text(SampleRange{tile.reached, *tile.wanted}));
+        if (tile.partial.samples.last == tile.wanted) continue;
+        throw InputError(text(tile.bucket) + " has " + std::to_string(tile.partial.samples.last) +
+                         " of its " + std::to_string(*tile.wanted) + " samples; render " +
+                         text(SampleRange{tile.partial.samples.last, *tile.wanted}));
     }
 }
 

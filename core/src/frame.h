@@ -45,10 +45,7 @@ class Frame {
     struct Tile {
         Bucket bucket;
         std::optional<int> wanted;
-        // What has come so far, in order, each run at least twice as long as the next: a mean of n
-        // partials is rounded log n times, not n.
-        std::vector<Partial> runs;
-        int reached = 0;     // samples, of them all
+        Partial partial;     // what has come so far
         double error = 0.0;  // of the whole of it
     };
 

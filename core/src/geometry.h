@@ -50,7 +50,9 @@ inline V3f direction_about(const V3f& w, float one_minus_cos, float turns) {
     const float radius = std::sqrt(std::max(0.0f, one_minus_cos * (2.0f - one_minus_cos)));
     const auto [sine, cosine] = sine_cosine(turns);
     const V3f d = w * (1.0f - one_minus_cos) + u * (radius * cosine) + v * (radius * sine);
-    return d * (1.0f / d.length());
+    // So close to length 1 that a step of Newton's method makes it so. Without it a long walk's
+    // errors would add up.
+    return d * (1.5f - 0.5f * d.length2());
 }
 
 inline float luminance(const Color& c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }

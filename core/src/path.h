@@ -45,7 +45,10 @@ class PathRandom {
     /// With what a walk goes on from event n: two numbers for the direction and one for the flight.
     /// For its first events they are stratified.
     std::array<float, 3> onward(int n, Random& walk) const {
-        if (n >= 3) return {walk.uniform(), walk.uniform(), walk.uniform()};
+        if (n >= 3) {
+            const auto [u1, u2] = walk.pair();
+            return {u1, u2, walk.uniform()};
+        }
         const Point point = stratified(walk_points + static_cast<std::uint64_t>(n));
         return {point[0], point[1], point[2]};
     }

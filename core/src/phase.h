@@ -29,22 +29,24 @@ class HenyeyGreenstein {
         return scale_ * base * std::sqrt(base);
     }
 
-    /// A direction drawn from `density`, from u1, u2 in [0, 1).
-    V3f sample(const V3f& in, float u1, float u2) const {
-        const V3f axis = g_ >= 0.0f ? in : -in;
-        return direction_about(axis, one_minus_cos(u1), u2);
+    struct Sample {
+        V3f direction;
+        float inverse_density;
+    };
+
+    /// A direction drawn from `density`, from u1, u2 in [0, 1): the inversion of the distribution,
+    /// rearranged so that nothing cancels and g = 0 needs no case.
+    Sample sample(const V3f& in, float u1, float u2) const {
+        const float g = std::abs(g_);
+        const float ratio = (1.0f - g) / (1.0f - g + 2.0f * g * u1);
+        const float one_minus_cos =
+            std::min(2.0f, 2.0f * (1.0f - u1) * (1.0f + g * u1) * ratio * ratio);
+        const float root = (1.0f + g) * ratio;  // of 1 + g^2 - 2 g cos(theta)
+        return {direction_about(g_ >= 0.0f ? in : -in, one_minus_cos, u2),
+                scale_ * root * root * root};
     }
 
   private:
-    /// The inversion of the distribution, rearranged so that nothing cancels and g = 0 needs no
-    /// case.
-    float one_minus_cos(float u) const {
-        const float g = std::abs(g_);
-        const float d = 1.0f - g + 2.0f * g * u;
-        return std::min(2.0f,
-                        2.0f * (1.0f - u) * (1.0f + g * u) * ((1.0f - g) / d) * ((1.0f - g) / d));
-    }
-
     float g_;
     float scale_;  // 4 pi / (1 - g^2)
 };

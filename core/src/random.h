@@ -7,6 +7,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 namespace pileus {
 
@@ -40,6 +41,13 @@ class Random {
 
     /// Uniform in [0, 1).
     constexpr float uniform() { return unit_float(static_cast<std::uint32_t>(bits() >> 32)); }
+
+    /// Two of them, of one draw.
+    constexpr std::array<float, 2> pair() {
+        const std::uint64_t word = bits();
+        return {unit_float(static_cast<std::uint32_t>(word >> 32)),
+                unit_float(static_cast<std::uint32_t>(word))};
+    }
 
   private:
     std::uint64_t state_;
@@ -75,7 +83,11 @@ constexpr std::array<std::array<std::uint32_t, 32>, dimensions> direction_number
     return v;
 }
 
-constexpr std::uint32_t reverse_bits(std::uint32_t x) {
+/// Four words, for arithmetic on all dimensions at once (GCC's and Clang's vectors).
+using Words = std::uint32_t __attribute__((vector_size(16)));
+
+template <class Word>
+constexpr Word reverse_bits(Word x) {
     x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
     x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
     x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
@@ -84,7 +96,8 @@ constexpr std::uint32_t reverse_bits(std::uint32_t x) {
 }
 
 /// A nested uniform (Owen) scramble of x: each bit is flipped by a hash of the bits above it.
-constexpr std::uint32_t owen_scramble(std::uint32_t x, std::uint32_t seed) {
+template <class Word>
+constexpr Word owen_scramble(Word x, Word seed) {
     x = reverse_bits(x);
     x ^= x * 0x3d20adeau;
     x += seed;
@@ -95,39 +108,45 @@ constexpr std::uint32_t owen_scramble(std::uint32_t x, std::uint32_t seed) {
 }
 
 /// The sum of direction numbers for each value of each byte of an index: a point takes four
-/// look-ups a dimension.
-using ByteTable = std::array<std::array<std::array<std::uint32_t, dimensions>, 256>, 4>;
+/// look-ups.
+struct ByteTable {
+    alignas(16) std::array<std::array<std::array<std::uint32_t, dimensions>, 256>, 4> sums{};
 
-constexpr ByteTable byte_table() {
-    constexpr auto directions = direction_numbers();
-    ByteTable table{};
-    for (unsigned byte = 0; byte < 4; ++byte) {
-        for (unsigned value = 1; value < 256; ++value) {
-            const auto lowest = static_cast<unsigned>(std::countr_zero(value));
-            for (unsigned d = 0; d < dimensions; ++d) {
-                table[byte][value][d] =
-                    table[byte][value & (value - 1)][d] ^ directions[d][8 * byte + lowest];
+    constexpr ByteTable() {
+        constexpr auto directions = direction_numbers();
+        for (unsigned byte = 0; byte < 4; ++byte) {
+            for (unsigned value = 1; value < 256; ++value) {
+                const auto lowest = static_cast<unsigned>(std::countr_zero(value));
+                for (unsigned d = 0; d < dimensions; ++d) {
+                    sums[byte][value][d] =
+                        sums[byte][value & (value - 1)][d] ^ directions[d][8 * byte + lowest];
+                }
             }
         }
     }
-    return table;
-}
+
+    Words operator()(unsigned byte, std::uint32_t index) const {
+        Words found;
+        std::memcpy(&found, &sums[byte][(index >> (8 * byte)) & 0xffu], sizeof found);
+        return found;
+    }
+};
 
 /// Point `index` of the sequence that `key` names: four scrambled coordinates in [0, 1). Sequences
 /// with different keys are shuffled against each other, so that they may be padded into higher
 /// dimensions.
 inline std::array<float, dimensions> point(std::uint32_t index, std::uint64_t key) {
-    static constexpr ByteTable table = byte_table();
+    static constexpr ByteTable table;
     const std::uint32_t shuffled = owen_scramble(index, static_cast<std::uint32_t>(mix64(key)));
+    const Words x =
+        table(0, shuffled) ^ table(1, shuffled) ^ table(2, shuffled) ^ table(3, shuffled);
+    const std::uint64_t low = hash_key(key, 1), high = hash_key(key, 2);
+    const Words seeds{static_cast<std::uint32_t>(low), static_cast<std::uint32_t>(low >> 32),
+                      static_cast<std::uint32_t>(high), static_cast<std::uint32_t>(high >> 32)};
+    const Words scrambled = owen_scramble(x, seeds);
     std::array<float, dimensions> result{};
-    for (unsigned d = 0; d < dimensions; ++d) {
-        std::uint32_t x = 0;
-        for (unsigned byte = 0; byte < 4; ++byte) {
-            x ^= table[byte][(shuffled >> (8 * byte)) & 0xffu][d];
-        }
-        const auto seed = static_cast<std::uint32_t>(hash_key(key, d + 1) >> 32);
-        result[d] = unit_float(owen_scramble(x, seed));
-    }
+    for (int d = 0; d < dimensions; ++d)
+        result[static_cast<unsigned>(d)] = unit_float(scrambled[d]);
     return result;
 }
 

@@ -17,6 +17,7 @@ from chaos.farm import Farm, frozen, until
 from pileus_service.jobs import WorkerView
 from pileus_service.queue import Queue
 from pileus_service.shot import Shot
+from pileus_worker.commands.worker import GRACE
 from serial_render import same_bits
 
 
@@ -79,7 +80,7 @@ def test_sigterm_is_obeyed_while_redis_does_not_answer(
         with frozen(farm.redis.pid):
             time.sleep(1)  # by now it waits for an answer
             process.terminate()
-            assert process.wait(60) == 0
+            assert process.wait(GRACE) == 0
 
 
 @pytest.mark.parametrize("verb", ["pause", "cancel"])

@@ -44,9 +44,8 @@ class Tracked final : public Method {
             light_.ask(event, n, n + 1, random, shadows);
             light_.ask_bridges(event, n, events_, random, bridges);
             const auto [u1, u2, u3] = random.onward(n, walk);
-            const HenyeyGreenstein& phase = schedule_.at(n).phase();
-            const V3f direction = phase.sample(event.direction, u1, u2);
-            const float inverse_density = phase.inverse_density(event.direction, direction);
+            const auto [direction, inverse_density] =
+                schedule_.at(n).phase().sample(event.direction, u1, u2);
             const Medium& medium = schedule_.onward(n);
             Track flight{.medium = &medium,
                          .ray = medium.ray(event.position, direction),

@@ -27,7 +27,7 @@ Path walk_on(const Medium& medium, ScatterEvent event, int orders, const DirectL
         kit.shadows.settle(record);
         if (order + 1 == orders) co_return;
         const auto [u1, u2, u3] = random.onward(order, walk);
-        event.direction = medium.phase().sample(event.direction, u1, u2);
+        event.direction = medium.phase().sample(event.direction, u1, u2).direction;
         const LocalRay onward = medium.ray(event.position, event.direction);
         const std::optional<NextEvent> found = next(onward, u3, walk);
         if (!found) co_return;
