@@ -115,8 +115,9 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
     const Lobe lobe(phase, last > 1);
     Random event_stream = random.stream(light_stream, static_cast<std::uint64_t>(first));
     const float roulette = first == 0 ? 0.0f : event_stream.uniform();
-    // A path has one first event and many later ones, so there noise counts more and time less.
-    const float rate = first == 0 ? 2.0f : 1.0f;
+    // A path has one first event, few early ones and many later ones: what their shadows' noise
+    // counts falls, and the time it takes to have less of it grows.
+    const float rate = first == 0 ? 3.0f : early(first) ? 1.5f : 1.0f;
     const auto asked = [&](float brightness) {
         return first == 0 ? 1.0f : chance(brightness, early(first));
     };
@@ -259,13 +260,19 @@ void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
 /// Whether event n comes before a walk has lost its direction, four transport mean free paths along
 /// it: what those events see of the light differs from pixel to pixel the most, and is worth more
 /// work.
-bool DirectLight::early(int n) const {
-    return static_cast<float>(n) * (1.0f - scene_.medium.phase().g()) < 4.0f;
-}
+bool DirectLight::early(int n) const { return transport_lengths(n) < 4.0f; }
 
 /// Whether light of event n's order also comes by bridges: where its lobe, and so those of the
-/// events before it, is the medium's own and narrow.
-bool DirectLight::bridged(int n) const { return reach_ > 0 && schedule_.plain(n); }
+/// events before it, is the medium's own and narrow, and until so many events have passed that
+/// what any one of them sees counts little.
+bool DirectLight::bridged(int n) const {
+    return reach_ > 0 && schedule_.plain(n) && transport_lengths(n) < 20.0f;
+}
+
+/// How many transport mean free paths a walk has gone by event n.
+float DirectLight::transport_lengths(int n) const {
+    return static_cast<float>(n) * (1.0f - scene_.medium.phase().g());
+}
 
 void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density,
                              int n, PathRecord& record) const {

@@ -135,6 +135,7 @@ class DirectLight {
         }
     }
 
+    float transport_lengths(int n) const;
     bool early(int n) const;
     bool bridged(int n) const;
     const std::optional<Chain>& chain(Bridges& bridges, std::size_t light, int n,
