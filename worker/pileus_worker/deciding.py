@@ -19,7 +19,7 @@ from pileus_service.shot import Shot
 from pileus_worker import planning, scene
 
 PILOT_PIXELS = 1024
-FEWEST_PIXELS = 256
+FEWEST_PIXELS = 128
 PILOT_SHARE = 0.04  # of the pixel samples that the frame seems to need
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
@@ -166,8 +166,9 @@ class Pilot:
     ) -> None:
         image = shot.image
         pixels = image.width * image.height
-        # Where the picture is itself small, each pixel of the pilot stands for sixteen of it.
-        wanted = min(max(FEWEST_PIXELS, pixels / 16), PILOT_PIXELS)
+        # Where the picture is itself small, each pixel of the pilot stands for forty of it: with
+        # one sample a pixel its halves are then a twentieth of the frame's least.
+        wanted = min(max(FEWEST_PIXELS, pixels / 40), PILOT_PIXELS)
         shrink = math.sqrt(min(1.0, wanted / pixels))
         width, height = max(1, round(image.width * shrink)), max(1, round(image.height * shrink))
         small = shot.model_copy(
