@@ -1,6 +1,7 @@
-"""Measures the denoiser on a shot's frames: its error by guide image, and how much it flickers.
+"""Measures the denoiser on a shot's frames: its error by quality and by guide, and its flicker.
 
     python bench/denoising.py SHOT [--set KEY=VALUE] [--samples 1,4,16] [--repeats N] [--truth N]
+        [--guides] [--still]
 
 The truth of a frame is two independent halves A and B by the shot's own method. The mean of
 (x - A)(x - B) is then the squared error without the truth's noise, and that of the same product of
@@ -9,8 +10,10 @@ relative as relMSE is, (r^2 + 0.01) below the line.
 """
 
 import argparse
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pileus_core as core
@@ -19,9 +22,10 @@ from numpy.typing import NDArray
 from pileus_service.shot import Shot
 from pileus_service.shotfile import load_shot
 from pileus_worker import deciding, machine, scene
-from pileus_worker.denoising import Filter, Pixels, guide_of
+from pileus_worker.denoising import Filter, Pixels, Quality, guide_of, quality_of
 
 Stack = NDArray[np.float64]  # (frames, height, width, 3)
+OWN_GUIDE = "mid-grey to white"
 TRUTH_SEEDS = (1_000_001, 1_000_002)
 
 
@@ -73,13 +77,29 @@ def guides(filter_: Filter) -> dict[str, Callable[[Pixels], Pixels | None]]:
         "none": lambda image: None,
         "white": lambda image: grey(np.ones_like(image[..., 3])),
         "opacity": lambda image: grey(image[..., 3]),
-        "prefiltered opacity": lambda image: filter_({"albedo": grey(image[..., 3])}),
-        "mid-grey to white": lambda image: guide_of(image[..., 3]),
+        "prefiltered opacity": lambda image: filter_({"albedo": grey(image[..., 3])}, "HIGH"),
+        OWN_GUIDE: lambda image: guide_of(image[..., 3]),
     }
 
 
-def denoised(filter_: Filter, image: Pixels, guide: Pixels | None) -> Pixels:
-    return filter_({"color": image} | ({} if guide is None else {"albedo": guide}))
+def filters(
+    filter_: Filter, quality: Quality, every_guide: bool
+) -> dict[str, Callable[[Pixels], Pixels]]:
+    """What is measured, by name: each quality with Pileus's own guide, and where they are asked
+    for the other guides too, with the one that Pileus takes."""
+    makers = guides(filter_)
+    asked: list[tuple[str, Quality]] = [(OWN_GUIDE, each) for each in get_args(Quality)]
+    if every_guide:
+        asked += [(guide, quality) for guide in makers if guide != OWN_GUIDE]
+
+    def one(guide: str, quality: Quality) -> Callable[[Pixels], Pixels]:
+        def run(image: Pixels) -> Pixels:
+            made = makers[guide](image)
+            return filter_({"color": image} | ({} if made is None else {"albedo": made}), quality)
+
+        return run
+
+    return {f"{guide} | {quality}": one(guide, quality) for guide, quality in asked}
 
 
 def stack(images: list[Pixels]) -> Stack:
@@ -93,6 +113,8 @@ def main() -> None:
     parser.add_argument("--samples", default="1,4,16")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--truth", type=int, default=256)
+    parser.add_argument("--guides", action="store_true", help="Measures other guides too.")
+    parser.add_argument("--still", action="store_true", help="And noise that stands still.")
     asked = parser.parse_args()
     shot = load_shot(asked.shot, asked.set)
     frames, filter_ = Frames(shot), Filter(machine.cores())
@@ -109,22 +131,25 @@ def main() -> None:
 
     truth_change = change(a, b) ** 0.5 if len(a) > 1 else 0.0
     print(f"the truth changes by {truth_change:.2%} from frame to frame")
-    print("samples | noise | guide | relMSE | flicker")
+    print("samples | noise | guide | quality | relMSE | flicker | core seconds")
     for samples in map(int, asked.samples.split(",")):
-        for moving in (True, False) if len(a) > 1 else (True,):
+        for moving in (True, False) if asked.still else (True,):
             runs = [frames.render(samples, seed, moving) for seed in range(1, asked.repeats + 1)]
-            kinds = {"not denoised": [stack(run) for run in runs]}
-            for name, guide in guides(filter_).items():
-                kinds[name] = [
-                    stack([denoised(filter_, image, guide(image)) for image in run]) for run in runs
-                ]
-            for name, sequences in kinds.items():
+            kinds = {"not denoised | -": ([stack(run) for run in runs], 0.0)}
+            taking = quality_of(shot.sampling.model_copy(update={"samples": samples}))
+            for name, filtered in filters(filter_, taking, asked.guides).items():
+                begun = time.process_time()
+                sequences = [stack([filtered(image) for image in run]) for run in runs]
+                taken = (time.process_time() - begun) / (len(runs) * len(a))
+                kinds[name] = sequences, taken
+            for name, (sequences, taken) in kinds.items():
                 errors = [error(x) for x in sequences]
                 spread = np.std(errors) / max(1, len(errors) - 1) ** 0.5
                 flicker = np.mean([change(x - a, x - b) for x in sequences]) if len(a) > 1 else 0.0
                 print(
                     f"{samples} | {'moving' if moving else 'still'} | {name} | "
-                    f"{np.mean(errors):.2e} +- {spread:.1e} | {max(0.0, flicker) ** 0.5:.2%}",
+                    f"{np.mean(errors):.2e} +- {spread:.1e} | {max(0.0, flicker) ** 0.5:.2%} | "
+                    f"{taken:.3f}",
                     flush=True,
                 )
 

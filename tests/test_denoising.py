@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pileus_core as core
@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pileus_service.shot import Shot
-from pileus_worker.denoising import guide_of
+from pileus_worker.denoising import Filter, Quality, guide_of
 
 pytest.importorskip("pyoidn", reason="Open Image Denoise has no wheel for this machine")
 
@@ -83,6 +83,28 @@ def test_images_of_any_shape_are_denoised(
     for channels in rendered(shot, tmp_path / "odd.exr").values():
         assert channels["R"].shape == size[::-1]
         assert all(np.isfinite(channels[c]).all() and (channels[c] >= 0).all() for c in "RGB")
+
+
+@pytest.mark.parametrize(
+    ("sampling", "quality"),
+    [
+        ({"samples": 4}, "FAST"),
+        ({"samples": 5}, "HIGH"),
+        ({"samples": 5, "tolerance": 0.2}, "FAST"),
+        ({"samples": 5, "tolerance": 0.19}, "HIGH"),
+    ],
+)
+def test_the_fast_network_is_taken_where_the_shot_asks_for_little(
+    noisy: Shot, tmp_path: Path, sampling: dict[str, Any], quality: Quality
+) -> None:
+    shot = changed(noisy, "sampling", **sampling)
+    hero = rendered(shot, tmp_path / "denoised.exr")["hero"]
+    color = np.stack([hero[f"noisy.{c}"] for c in "RGB"], axis=-1)
+    images = {"color": color, "albedo": guide_of(hero["A"])}
+    own = np.stack([hero[c] for c in "RGB"], axis=-1)
+    by_quality = {each: Filter(2)(images, each) for each in get_args(Quality)}
+    np.testing.assert_array_equal(own, by_quality[quality])
+    assert not np.array_equal(by_quality["FAST"], by_quality["HIGH"])
 
 
 def test_the_guide_spreads_the_opacity_and_keeps_its_mean() -> None:

@@ -5,16 +5,19 @@ What other guides bring to volumes, and what they cost, is measured in docs/deno
 """
 
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pileus_core as core
 from numpy.typing import NDArray
 
 from pileus_service.errors import FarmError, InputError
-from pileus_service.shot import Shot
+from pileus_service.shot import Sampling, Shot
 
 Pixels = NDArray[np.float32]
+Quality = Literal["FAST", "BALANCED", "HIGH"]  # as OIDN calls its networks
+FEW_SAMPLES = 4
+LOOSE_TOLERANCE = 0.2  # what so many samples come to
 
 
 def check_installed(shot: Shot, source: str) -> None:
@@ -32,8 +35,17 @@ def denoise(frame: core.Frame, shot: Shot, threads: int) -> None:
         return
     filter_ = Filter(threads)
     images = [frame.pixels(look.name) for look in shot.transport.looks]
-    guide = guide_of(images[0][..., 3])
-    frame.set_denoised([filter_({"color": image, "albedo": guide}) for image in images])
+    guide, quality = guide_of(images[0][..., 3]), quality_of(shot.sampling)
+    frame.set_denoised([filter_({"color": image, "albedo": guide}, quality) for image in images])
+
+
+def quality_of(sampling: Sampling) -> Quality:
+    """The network for a shot's frames. HIGH costs about a sample a pixel more than FAST: where
+    there are few, that sample would take away more of the error than HIGH does. The shot alone
+    decides, so that no sequence changes its network on the way."""
+    few = sampling.samples <= FEW_SAMPLES
+    loose = sampling.tolerance is not None and sampling.tolerance >= LOOSE_TOLERANCE
+    return "FAST" if few or loose else "HIGH"
 
 
 class Filter:
@@ -50,7 +62,7 @@ class Filter:
         self._device.commit()
         self._check()
 
-    def __call__(self, images: dict[str, Pixels]) -> Pixels:
+    def __call__(self, images: dict[str, Pixels], quality: Quality) -> Pixels:
         """Filters a linear `color` of any range with the guides `albedo` and `normal`, or a guide
         alone. All are of shape (height, width, 3 or more) and their first three channels count;
         returns (height, width, 3). Raises FarmError."""
@@ -63,7 +75,7 @@ class Filter:
                 rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
             if "color" in images:
                 rt.set_bool("hdr", True)
-            rt.set_quality(oidn.OIDN_QUALITY_HIGH)
+            rt.set_quality(getattr(oidn, f"OIDN_QUALITY_{quality}"))
             rt.commit()
             rt.execute()
             self._check()
