@@ -1,16 +1,18 @@
 """deploy/containers and deploy/systemd, really run: images built upon a bare Debian 12, a farm of
-their containers, and the same files under a systemd of their own, in its sandbox.
+their containers, by hand and by a compose file, and the same files under a systemd of their own, in
+its sandbox.
 """
 
 import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from pileus_worker.private_redis import NO_PASSWORD_FITS
 
 ROOT = Path(__file__).parent.parent
 DEPLOY = ROOT / "deploy"
-TOOLS = ("buildah", "debootstrap", "systemd-nspawn", "systemd-analyze")
+TOOLS = ("buildah", "debootstrap", "podman-compose", "systemd-nspawn", "systemd-analyze")
 USER = 970
 PASSWORD = "a secret"
 
@@ -34,7 +36,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
         os.geteuid() != 0 or not all(map(shutil.which, TOOLS)),
-        reason="needs root, buildah, debootstrap and systemd (`make test-slow` installs them)",
+        reason="needs root, buildah, podman and systemd (`make test-slow` installs them)",
     ),
     pytest.mark.xdist_group("deployed"),
 ]
@@ -50,6 +52,7 @@ class Buildah:
     """Its commands over a store of our own, without a container runtime."""
 
     def __init__(self, folder: Path) -> None:
+        self.folder = folder
         self._store = ["--root", str(folder / "store"), "--runroot", str(folder / "run")]
         self._options: list[str] = []
         self._trust_what_this_host_trusts(folder)
@@ -205,6 +208,80 @@ def test_a_farm_of_containers_renders_a_shot(
                 until(client.workers, 180)
                 assert worker.healthy()
                 finish(client, asked)
+    assert (shows / "out" / "test.0001.exr").stat().st_uid == USER
+    same_images(PathMap.parse([f"/shows={shows}"]).shot(asked), tmp_path)
+
+
+@pytest.fixture
+def compose(
+    buildah: Buildah, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., str]]:
+    """Commands for an engine over the same store, with settings and networks of its own."""
+    redis = buildah("from", "bare")
+    install = "apt-get update -qq && apt-get install -qq -y --no-install-recommends redis-server"
+    install += " && mkdir /data && chown redis: /data"
+    buildah("run", "--isolation", "chroot", redis, "--", "sh", "-c", install)
+    # Under the name of the image that the file asks for, and without an entry point of its own.
+    buildah("commit", "--quiet", "--format", "docker", redis, "docker.io/library/redis:7-bookworm")
+    (tmp_path / "containers.conf").write_text(
+        f'''[containers]
+        default_ulimits = ["nofile=1024:1024", "nproc=4096:4096"]
+        [engine]
+        cgroup_manager = "cgroupfs"
+        tmp_dir = "{tmp_path}/libpod"
+        [network]
+        network_config_dir = "{tmp_path}/networks"
+        '''
+    )
+    (tmp_path / "storage.conf").write_text(
+        f'''[storage]
+        driver = "{buildah("info", "--format", "{{.store.GraphDriverName}}")}"
+        graphroot = "{buildah.folder}/store"
+        runroot = "{buildah.folder}/run"
+        '''
+    )
+    monkeypatch.setenv("CONTAINERS_CONF", str(tmp_path / "containers.conf"))
+    monkeypatch.setenv("CONTAINERS_STORAGE_CONF", str(tmp_path / "storage.conf"))
+    monkeypatch.setenv("PILEUS_PASSWORD", PASSWORD)
+    # crun refuses a host that has the second cgroups beside the first: the engine sees the first.
+    hide = "umount /sys/fs/cgroup/unified; exec sleep infinity"
+    with process(tmp_path / "engine.log", "unshare", "--mount", "sh", "-c", hide) as space:
+        inside = ["nsenter", "-t", str(space.pid), "--mount"]
+        farm = ["podman-compose", "-p", "pileus", "-f", str(DEPLOY / "containers/compose.yaml")]
+
+        def told(*words: str) -> str:
+            return run(*inside, *([] if words[0] == "podman" else farm), *words)
+
+        try:
+            yield told
+        finally:
+            told("down")
+            told("podman", "volume", "rm", "--all", "--force")
+
+
+def test_the_compose_file_brings_up_a_farm(
+    compose: Callable[..., str],
+    tmp_path: Path,
+    shows: Path,
+    asked: Shot,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    port = free_port()
+    farm = tmp_path / "farm"
+    farm.mkdir()
+    os.chown(farm, USER, USER)
+    for name, value in {"FARM": farm, "SHOWS": shows, "PORT": port}.items():
+        monkeypatch.setenv(name, str(value))
+    create = "token create ops --role admin"
+    told = compose("run", "--rm", "-T", "--entrypoint", "pileus", "service", *create.split())
+    [token] = re.findall(r"ops\.\S+", told)
+    compose("up", "-d", "--no-build")
+    with Client(f"http://127.0.0.1:{port}", token) as client:
+        until(lambda: connects(port), 180)
+        until(client.workers, 180)
+        for name in ("service", "worker"):
+            compose("podman", "healthcheck", "run", f"pileus_{name}_1")
+        finish(client, asked)
     assert (shows / "out" / "test.0001.exr").stat().st_uid == USER
     same_images(PathMap.parse([f"/shows={shows}"]).shot(asked), tmp_path)
 
