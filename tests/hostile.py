@@ -4,7 +4,7 @@ a process with limits in which to read them as the renderer does."""
 import multiprocessing
 import random
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -149,10 +149,10 @@ def seeds(folder: Path) -> dict[str, list[bytes]]:
 
 
 def hostile_files(
-    folder: Path, suffix: str, count: int, seed: int
+    folder: Path, suffix: str, count: int, seed: int, more: Sequence[bytes] = ()
 ) -> Iterator[tuple[int, Path, bytes]]:
     """Writes mutants one by one under one name; the same seed gives the same files."""
-    right = seeds(folder)[suffix]
+    right = [*seeds(folder)[suffix], *more]
     for number in range(count):
         dice = random.Random(f"{seed}.{suffix}.{number}")
         data = mutated(dice.choice(right), right, dice)
