@@ -16,6 +16,7 @@
 #include <OpenEXR/ImfPartType.h>
 #include <OpenEXR/ImfRationalAttribute.h>
 #include <OpenEXR/ImfStringAttribute.h>
+#include <OpenEXR/ImfTestFile.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -184,6 +185,10 @@ std::vector<std::string> all_printable(std::vector<std::string> texts) {
     return texts;
 }
 
+InputError unreadable(const std::string& path, const std::exception& error) {
+    return InputError(path + ": cannot be read as an EXR image (" + printable(error.what()) + ")");
+}
+
 }  // namespace
 
 ExrFile read_exr(const std::string& path) {
@@ -234,8 +239,24 @@ ExrFile read_exr(const std::string& path) {
         }
         return result;
     } catch (const std::exception& error) {
-        throw InputError(path + ": cannot be read as an EXR image (" + printable(error.what()) +
-                         ")");
+        throw unreadable(path, error);
+    }
+}
+
+void check_channels(const std::string& path) {
+    if (!Imf::isOpenExrFile(path.c_str())) return;
+    try {
+        const Imf::MultiPartInputFile file(path.c_str());
+        for (int p = 0; p < file.parts(); ++p) {
+            const Imf::ChannelList& channels = file.header(p).channels();
+            for (auto c = channels.begin(); c != channels.end(); ++c) {
+                if (c.channel().type < 0 || c.channel().type >= Imf::NUM_PIXELTYPES)
+                    throw InputError("channel \"" + std::string(c.name()) +
+                                     "\" is of no known kind");
+            }
+        }
+    } catch (const std::exception& error) {
+        throw unreadable(path, error);
     }
 }
 

@@ -67,4 +67,8 @@ struct ExrFile {
 /// channels. Throws InputError, naming the file.
 ExrFile read_exr(const std::string& path);
 
+/// Throws InputError for an OpenEXR file with a channel of no known kind, at which OpenImageIO ends
+/// the process. Other files pass.
+void check_channels(const std::string& path);
+
 }  // namespace pileus

@@ -1,6 +1,7 @@
 #include "texture.h"
 
 #include "error.h"
+#include "exr_file.h"
 #include "printable.h"
 
 #include <dlfcn.h>
@@ -13,6 +14,7 @@ Texture read_texture(const std::string& path) {
     // dlerror tells its reason once.
     static const std::string reason = library ? "" : ::dlerror();
     if (!library) throw std::runtime_error(path + ": " + reason);
+    check_channels(path);
     static auto* const read = reinterpret_cast<Read*>(::dlsym(library, "pileus_read_texture"));
     Texture texture;
     std::string trouble;

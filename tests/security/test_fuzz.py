@@ -87,6 +87,21 @@ def test_what_python_would_not_print_is_shown_escaped_in_an_error(tmp_path: Path
     )
 
 
+def test_a_texture_with_a_channel_of_no_known_kind_is_refused(
+    reader: Reader, tmp_path: Path
+) -> None:
+    """OpenEXR looks at the channels of the types of part that it knows; OpenImageIO ends the process
+    at such a channel."""
+    right = seeds(tmp_path)[".exr"][0]
+    kind = b"variance.G\0" + (2).to_bytes(4, "little")
+    spoiled = right.replace(kind, kind[:-4] + (3).to_bytes(4, "little"))
+    file = tmp_path / "sky.exr"
+    file.write_bytes(spoiled.replace(b"scanlineimage", b"scanlineimago"))
+    outcome = reader.read(file)
+    assert outcome.how == "refused", outcome
+    assert "of no known kind" in outcome.line
+
+
 @pytest.mark.parametrize("frames", [8, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_farm_on_hostile_caches_loses_no_worker(
     tmp_path: Path, shot: dict[str, Any], frames: int
