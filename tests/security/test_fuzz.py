@@ -90,8 +90,8 @@ def test_what_python_would_not_print_is_shown_escaped_in_an_error(tmp_path: Path
 def test_a_texture_with_a_channel_of_no_known_kind_is_refused(
     reader: Reader, tmp_path: Path
 ) -> None:
-    """OpenEXR looks at the channels of the types of part that it knows; OpenImageIO ends the process
-    at such a channel."""
+    """OpenEXR looks at the channels of those types of part that it knows; OpenImageIO ends the
+    process at such a channel."""
     right = seeds(tmp_path)[".exr"][0]
     kind = b"variance.G\0" + (2).to_bytes(4, "little")
     spoiled = right.replace(kind, kind[:-4] + (3).to_bytes(4, "little"))
