@@ -15,7 +15,7 @@ from pileus_service.errors import FarmError, InputError
 from pileus_service.shot import Sampling, Shot
 
 Pixels = NDArray[np.float32]
-Quality = Literal["FAST", "BALANCED", "HIGH"]  # as OIDN calls its networks
+Quality = Literal["FAST", "HIGH"]  # as OIDN calls its networks; BALANCED is HIGH on a CPU
 FEW_SAMPLES = 4
 LOOSE_TOLERANCE = 0.2  # what so many samples come to
 
