@@ -82,15 +82,17 @@ def small_shot(folder: Path, frames: int, name: str, samples: int) -> Shot:
     )
 
 
-def finish(farm: Farm, job: str, seconds: float) -> int:
-    """Sees a job through; returns how many of its frames had to be retried."""
-    retried, end = 0, time.monotonic() + seconds
+def finish(farm: Farm, job: str, seconds: float) -> list[str]:
+    """Sees a job through; returns why each of its frames failed that had to be retried."""
+    retried: list[str] = []
+    end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:
             view = farm.client.job(job)
             if view.state == "failed":
-                retried += view.frames_failed
+                why = [f"{job} {each.reason}" for each in farm.client.frames(job) if each.reason]
                 farm.client.control(job, "retry")
+                retried += why
             elif view.state == "done":
                 return retried
         except FarmError:
@@ -118,7 +120,8 @@ def chaos(
     """Renders at least so many tasks under fire, or for so long, checks all that is left; returns
     the figures."""
     jobs: list[tuple[str, Shot]] = []
-    done = retried = 0
+    retried: list[str] = []
+    done = 0
     begun = time.monotonic()
     with Farm(folder, [folder], workers, task_seconds=0.001) as farm:
         farm.until_workers(workers)
@@ -157,7 +160,8 @@ def chaos(
         "kills": dict(killer.kills),
         "leases_lost": stats.get("leases_lost", 0),
         "attempts_failed": stats.get("attempts_failed", 0),
-        "frames_retried": retried,
+        "frames_retried": len(retried),
+        "why": retried,
         "left_over": left,
     }
 

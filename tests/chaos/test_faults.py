@@ -69,6 +69,26 @@ def test_frames_are_right_whatever_is_killed(size: dict[str, int], tmp_path: Pat
     assert figures["kills"]
 
 
+def test_a_child_that_dies_while_it_starts_costs_no_attempt(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    with Farm(tmp_path, [tmp_path], 1) as farm:
+        job = farm.client.submit(cached_shot).job.id
+        [worker] = farm.workers
+        killed: set[int] = set()
+
+        def enough() -> bool:
+            for pid in worker.children:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                    killed.add(pid)
+            return len(killed) > 5
+
+        until(enough)
+        assert ended(farm, job).state == "done"
+        assert farm.queue.stats().get("attempts_failed", 0) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", [False, True], ids=["supervisor", "supervisor and child"])
 def test_a_thawed_worker_changes_nothing(cached_shot: Shot, tmp_path: Path, whole: bool) -> None:

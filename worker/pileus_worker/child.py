@@ -161,12 +161,14 @@ class Life:
         from pileus_service.roots import Roots
         from pileus_service.store import Store
         from pileus_worker.caches import Caches
+        from pileus_worker.tasks import Work
 
         self._pipe = pipe
         self._setup = setup
         self._store, self._roots = Store(setup.data), Roots(setup.roots, setup.data)
         self._caches = Caches(setup.cache_bytes, setup.paths, self._roots.reading)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="task")
+        self._new_work = Work
         self._work: Work | None = None
         self._saying = threading.Lock()
         self._permitted = threading.Event()
@@ -174,6 +176,7 @@ class Life:
         self._told_bytes = 0
 
     def live(self) -> None:
+        self._say(Beat(0))
         while True:
             work = self._work
             if not self._pipe.poll(TICK):
@@ -195,9 +198,7 @@ class Life:
                 self._permitted.set()
 
     def _begin(self, order: Order) -> "Work":
-        from pileus_worker.tasks import Work
-
-        return Work(
+        return self._new_work(
             self._store,
             self._roots,
             self._caches,

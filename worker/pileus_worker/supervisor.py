@@ -103,6 +103,13 @@ class Child:
         # Until its first word it reads its program, which on a busy machine or a slow network takes
         # as long as any reading may.
         self._silence = setup.stall_seconds
+        self._started = False
+
+    def ready(self, seconds: float) -> bool:
+        """Whether it can take an order; its first word is waited for, so long at most."""
+        if self._started and not self._process.is_alive():
+            raise ChildLostError(self._how_it_ended())
+        return self._started or self.hear(seconds) is not None
 
     def order(self, order: child.Order) -> None:
         self._heard = time.monotonic()
@@ -120,7 +127,7 @@ class Child:
         try:
             if self._pipe.poll(seconds):
                 message: child.Message = self._pipe.recv()
-                self._heard, self._silence = time.monotonic(), SILENCE
+                self._heard, self._silence, self._started = time.monotonic(), SILENCE, True
                 return message
         except (EOFError, OSError):
             raise ChildLostError(self._how_it_ended()) from None
@@ -198,6 +205,8 @@ class Supervisor:
         )
         self._child: Child | None = None
         self._output = Output()
+        # What was dropped while Redis was away, to be handed back when it is there again.
+        self._owed: Task | None = None
         # As Redis was when last spoken to: while it is away, nothing is told it that can be spared.
         self._away = False
         # Jobs whose next cache is not read ahead: a child was lost that did so.
@@ -208,8 +217,13 @@ class Supervisor:
         structlog.contextvars.bind_contextvars(worker=self.info.name)
         try:
             while not ending.asked.is_set():
+                if not self._ready(ending):
+                    continue
                 asked_at = time.monotonic()
                 try:
+                    if self._owed is not None:
+                        self._queue.hand_back(self._owed, self.info.name)
+                        self._owed = None
                     task = self._queue.claim(self.info)
                     self._away = False
                 except RedisError as error:
@@ -227,6 +241,19 @@ class Supervisor:
                 log.info("Redis is gone before us; nothing to say goodbye to")
         finally:
             self._drop_child()
+
+    def _ready(self, ending: Ending) -> bool:
+        """Whether the child can do a task at once: none is claimed for one that still starts, which
+        would hold it up for seconds, and its end in that time would count as the task's attempt."""
+        try:
+            if self._child is None:
+                self._child = Child(self._setup, self._output)
+            return self._child.ready(IDLE)
+        except (ChildLostError, OSError) as error:
+            self._drop_child()
+            log.warning("no render process", reason=str(error), output=self._output.take())
+            ending.asked.wait(PATIENCE)
+            return False
 
     def _attempt(self, task: Task, leased: float, ending: Ending) -> None:
         """Does a task whose lease began at `leased`, and says how that went."""
@@ -355,6 +382,7 @@ class Supervisor:
                 # Another has it by now, or will: nobody is to do one thing twice at a time.
                 log.warning("dropped: no word from Redis for as long as a lease")
                 self._stop_child(renderer)
+                self._owed = task
                 return None
             self._keep_within_limits(renderer, now - moved)
 

@@ -20,7 +20,15 @@ local function each_pending(stream, idle, act)
   end
 end
 
--- A clock set back would make each lease last that much longer: all begin anew from here.
+-- Whether the age of leases says nothing of those who hold them. A clock set back would make each
+-- last that much longer. And where no worker at all was heard of in the time within which all renew
+-- theirs (each 2.5 s of 10), it was Redis that was away, or its clock that jumped.
+local function leases_are_void(time, last)
+  local heard = tonumber(redis.call('ZRANGE', 'pileus:alive', -1, -1, 'WITHSCORES')[2] or time)
+  return time < last - 1000 or time > heard + 0.75 * LEASE
+end
+
+-- All leases begin anew from here.
 local function begin_leases_anew(time)
   each_stream(function(stream)
     each_pending(stream, 0, function(id, owner)
@@ -39,7 +47,7 @@ local function take_expired()
   each_stream(function(stream)
     each_pending(stream, LEASE, function(id, owner)
       if owner == RELEASED then return end
-      record_try(stream, id, owner, 'stopped answering')
+      record_try(stream, id, owner, LOST)
       count('leases_lost')
       redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'JUSTID')
       local task = read(stream, id)
@@ -68,7 +76,7 @@ local function look_around()
   local time, last = now(), tonumber(redis.call('GET', 'pileus:clock') or 0)
   if time >= last and time < last + SWEEP then return end
   redis.call('SET', 'pileus:clock', time)
-  if time < last - 1000 then begin_leases_anew(time) end
+  if leases_are_void(time, last) then begin_leases_anew(time) end
   take_expired()
   wake(time)
 end
@@ -141,8 +149,8 @@ local function take_new(priority, stream)
   end
 end
 
-greet(worker, info)
 look_around()
+greet(worker, info)
 if aside(worker) then return nil end
 for priority = 9, 0, -1 do
   local stream = stream_of(priority)
