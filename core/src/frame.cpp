@@ -36,7 +36,7 @@ Frame::Frame(int width, int height, std::vector<std::pair<Bucket, std::optional<
                 pixel = true;
             }
         }
-        tiles_.push_back({bucket, samples, {}});
+        tiles_.push_back({bucket, samples, 0, {}});
     }
     if (std::find(covered.begin(), covered.end(), false) != covered.end()) {
         throw InputError("the plan's buckets leave pixels uncovered");
@@ -60,7 +60,7 @@ void Frame::add(const Partial& partial) {
         throw InputError(text(window) + ", " + text(partial.samples) +
                          " is of another frame (identity, looks or orders differ)");
     }
-    const int reached = tile->partial.samples.last;
+    const int reached = tile->reached;
     const int wanted = tile->wanted.value_or(partial.samples.last);
     if (partial.samples.count() < 1 || partial.samples.first != reached ||
         partial.samples.last > wanted) {
@@ -69,21 +69,25 @@ void Frame::add(const Partial& partial) {
                          std::to_string(wanted));
     }
     tile->wanted = wanted;
+    tile->reached = partial.samples.last;
     bounded_paths_ += partial.bounded_paths;
-    if (reached == 0) {
-        tile->partial = partial;
-    } else {
-        tile->partial.pool(partial);
+    const bool whole = tile->reached == wanted;
+    std::vector<Partial>& held = tile->partials;
+    held.push_back(partial);
+    while (held.size() > 1 &&
+           (whole || held.rbegin()[1].samples.count() <= held.back().samples.count())) {
+        held.rbegin()[1].pool(held.back());
+        held.pop_back();
     }
-    if (tile->partial.samples.last == tile->wanted) {
-        tile->error = tile->partial.relative_error();
+    if (whole) {
+        tile->error = held.front().relative_error();
         place(*tile);
-        tile->partial.image = {};
+        held.clear();
     }
 }
 
 void Frame::place(const Tile& tile) {
-    const LayeredImage& source = tile.partial.image;
+    const LayeredImage& source = tile.partials.front().image;
     const Bucket& window = tile.bucket;
     for (std::size_t look = 0; look < source.looks().size(); ++look) {
         for (std::size_t c = 0; c < source.channels().size(); ++c) {
@@ -99,7 +103,7 @@ void Frame::place(const Tile& tile) {
 double Frame::mean_samples() const {
     double samples = 0.0, pixels = 0.0;
     for (const Tile& tile : tiles_) {
-        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
+        if (!tile.wanted || tile.reached != tile.wanted) continue;
         const auto area = static_cast<double>(tile.bucket.pixels());
         samples += *tile.wanted * area;
         pixels += area;
@@ -110,7 +114,7 @@ double Frame::mean_samples() const {
 double Frame::relative_error() const {
     double squares = 0.0, pixels = 0.0;
     for (const Tile& tile : tiles_) {
-        if (!tile.wanted || tile.partial.samples.last != tile.wanted) continue;
+        if (!tile.wanted || tile.reached != tile.wanted) continue;
         const auto area = static_cast<double>(tile.bucket.pixels());
         squares += tile.error * tile.error * area;
         pixels += area;
@@ -121,10 +125,10 @@ double Frame::relative_error() const {
 void Frame::require_complete() const {
     for (const Tile& tile : tiles_) {
         if (!tile.wanted) throw InputError(text(tile.bucket) + " has no samples; render it");
-        if (tile.partial.samples.last == tile.wanted) continue;
-        throw InputError(text(tile.bucket) + " has " + std::to_string(tile.partial.samples.last) +
-                         " of its " + std::to_string(*tile.wanted) + " samples; render " +
-                         text(SampleRange{tile.partial.samples.last, *tile.wanted}));
+        if (tile.reached == tile.wanted) continue;
+        throw InputError(text(tile.bucket) + " has " + std::to_string(tile.reached) + " of its " +
+                         std::to_string(*tile.wanted) + " samples; render " +
+                         text(SampleRange{tile.reached, *tile.wanted}));
     }
 }
 

@@ -42,11 +42,15 @@ class Frame {
     std::int64_t bounded_paths() const { return bounded_paths_; }
 
   private:
+    /// What has come of a bucket. Partials are pooled with others of about their size, as each
+    /// pooling rounds to a float: one after the other, hundreds would drift, and late ones hardly
+    /// count.
     struct Tile {
         Bucket bucket;
         std::optional<int> wanted;
-        Partial partial;     // what has come so far
-        double error = 0.0;  // of the whole of it
+        int reached = 0;                // samples
+        std::vector<Partial> partials;  // in order, each of more samples than the next
+        double error = 0.0;             // of all of them
     };
 
     void require_complete() const;

@@ -131,6 +131,21 @@ TEST(Frame, TakesAsManySamplesAsAnOpenBucketsOnePartialHas) {
     EXPECT_DOUBLE_EQ(frame.mean_samples(), 18.0);
 }
 
+TEST(Frame, OfManyShortRangesIsTheMeanOfTheirSamples) {
+    constexpr int samples = 1000;
+    Frame frame(width, height, {{{0, 0, width, height}, samples}});
+    double sum = 0.0;
+    for (int i = 0; i < samples; ++i) {
+        Partial partial = make_partial({0, 0, width, height}, {i, i + 1}, "shot", {"beauty"});
+        // Each late sample moves the mean of all before it by less than a float's last digit.
+        const float opacity = i < 300 ? 1.0f : 1.0f - 1e-5f;
+        sum += double{opacity};
+        partial.image.plane(0, Partial::a)[0] = opacity;
+        frame.add(partial);
+    }
+    EXPECT_NEAR(double{frame.image().plane(0, Partial::a)[0]}, sum / samples, 5e-7);
+}
+
 TEST(Frame, RefusesWhatIsDoubledMissingOrForeign) {
     Frame frame(width, height, plan);
     frame.add(make_partial(left, {0, 8}, "shot"));
