@@ -1,7 +1,7 @@
 // The sampling structure: 8^3 bricks of half floats under nodes of 8^3 children, as many levels of
-// nodes as the grid is wide. Each child carries exact bounds of the trilinearly interpolated field
-// over its cells, so that a ray crosses empty space in a few steps and every majorant is local
-// (after Museth 2013, whose tree it is built from, and the hierarchical DDA of Museth 2014).
+// nodes as the grid is wide. Each child carries the exact majorant of the trilinearly interpolated
+// field over its cells, so that a ray crosses empty space in a few steps and every majorant is
+// local (after Museth 2013, whose tree it is built from, and the hierarchical DDA of Museth 2014).
 #pragma once
 
 #include "geometry.h"
@@ -29,15 +29,8 @@ constexpr Half encode_half(float value) {
     return static_cast<Half>((bits + 0xfffu + ((bits >> 13) & 1u)) >> 13);
 }
 
-/// Least and greatest value of the interpolated field over some cells.
-struct Bounds {
-    float min = std::numeric_limits<float>::infinity();
-    float max = 0.0f;
-    void include(const Bounds& other) {
-        min = std::min(min, other.min);
-        max = std::max(max, other.max);
-    }
-};
+/// What a ray crosses at a time where the tree is finest: a brick, or eight of them.
+enum class Boxes { bricks, eights };
 
 /// A sparse field of non-negative values at integer coordinates, zero where nothing is stored.
 /// Coordinates are local: they start at (0, 0, 0) in the corner of the root.
@@ -56,10 +49,11 @@ class BrickTree {
 
     struct Node {
         std::array<Child, entries> child;
-        std::array<Half, entries> min, max;
+        std::array<Half, entries> max;        // over a child's cells
+        std::array<Half, entries> eight_max;  // over those of the 2^3, aligned, that it is one of
     };
 
-    /// The largest box of cells around a point on which the tree has one pair of bounds to offer.
+    /// The largest box of cells around a point on which the tree has one majorant to offer.
     struct Cells {
         V3i low;
         int size;
@@ -78,7 +72,8 @@ class BrickTree {
     const V3i& low() const { return low_; }
     const V3i& high() const { return high_; }
 
-    const Bounds& bounds() const { return bounds_; }
+    /// The greatest value of all.
+    float max() const { return max_; }
 
     std::size_t bytes() const {
         return nodes_.capacity() * sizeof(Node) + brick_count_ * sizeof(Brick);
@@ -109,19 +104,26 @@ class BrickTree {
         return interpolate(x, cursor);
     }
 
+    static constexpr int width_of(Boxes boxes) {
+        return boxes == Boxes::bricks ? width : 2 * width;
+    }
+
     /// The cells around one cell inside the root, with the majorant of the field over them.
-    Cells cells(const V3i& cell) const {
+    Cells cells(const V3i& cell, Boxes boxes = Boxes::bricks) const {
         const Node* node = &nodes_[0];
         for (int level = levels_;; --level) {
             const int shift = log2_width * level;
             const unsigned e = entry(cell, shift);
             const Child child = node->child[e];
             const Half majorant = node->max[e];
-            if (level == 1 || majorant == 0 || (child & constant_bit)) {
-                const int mask = ~((1 << shift) - 1);
-                return {V3i(cell.x & mask, cell.y & mask, cell.z & mask), 1 << shift,
-                        scale_ * decode_half(majorant), level == 1 ? node : nullptr};
-            }
+            const auto box = [&](int size, Half most, const Node* lowest) {
+                return Cells{V3i(cell.x & -size, cell.y & -size, cell.z & -size), size,
+                             scale_ * decode_half(most), lowest};
+            };
+            if (level == 1)
+                return box(width_of(boxes), boxes == Boxes::bricks ? majorant : node->eight_max[e],
+                           node);
+            if (majorant == 0 || (child & constant_bit)) return box(1 << shift, majorant, nullptr);
             node = &nodes_[child];
         }
     }
@@ -177,7 +179,7 @@ class BrickTree {
     int extent_ = 0;
     float scale_ = 1.0f;  // a power of two: halves hold value / scale
     V3i low_{0}, high_{0};
-    Bounds bounds_{0.0f, 0.0f};
+    float max_ = 0.0f;
 };
 
 }  // namespace pileus

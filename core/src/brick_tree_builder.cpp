@@ -74,38 +74,26 @@ void count(Value value, std::int64_t times, Census& census) {
     }
 }
 
-struct Range {
-    Half min = 0xffff, max = 0;
-    void include(Range other) {
-        min = std::min(min, other.min);
-        max = std::max(max, other.max);
-    }
-};
-
-/// The range of a brick's voxels over each of its low sides: element m covers the voxels whose
+/// The greatest of a brick's voxels over each of its low sides: element m covers the voxels whose
 /// coordinate is 0 along every axis whose bit (4 = x, 2 = y, 1 = z) is set in m; element 0 covers
 /// them all.
-using Sides = std::array<Range, 8>;
+using Sides = std::array<Half, 8>;
 
-/// The range over `rows` rows of 8 voxels, each `step` apart, the rows `pitch` apart.
+/// The greatest of `rows` rows of 8 voxels, each `step` apart, the rows `pitch` apart.
 template <int rows, int pitch, int step>
-Range range_of_rows(const Half* voxels) {
-    Range range;
+Half greatest_of_rows(const Half* voxels) {
+    Half greatest = 0;
     for (int row = 0; row < rows; ++row) {
-        for (int i = 0; i < 8; ++i) {
-            const Half value = voxels[row * pitch + i * step];
-            range.min = std::min(range.min, value);
-            range.max = std::max(range.max, value);
-        }
+        for (int i = 0; i < 8; ++i) greatest = std::max(greatest, voxels[row * pitch + i * step]);
     }
-    return range;
+    return greatest;
 }
 
 PILEUS_DISPATCH Sides sides_of(const Half* voxels) {
-    return {range_of_rows<64, 8, 1>(voxels), range_of_rows<8, 64, 8>(voxels),
-            range_of_rows<8, 64, 1>(voxels), range_of_rows<1, 0, 64>(voxels),
-            range_of_rows<8, 8, 1>(voxels),  range_of_rows<1, 0, 8>(voxels),
-            range_of_rows<1, 0, 1>(voxels),  Range{voxels[0], voxels[0]}};
+    return {greatest_of_rows<64, 8, 1>(voxels), greatest_of_rows<8, 64, 8>(voxels),
+            greatest_of_rows<8, 64, 1>(voxels), greatest_of_rows<1, 0, 64>(voxels),
+            greatest_of_rows<8, 8, 1>(voxels),  greatest_of_rows<1, 0, 8>(voxels),
+            greatest_of_rows<1, 0, 1>(voxels),  voxels[0]};
 }
 
 struct Tile {
@@ -137,10 +125,10 @@ class BrickTreeBuilder {
     void insert(std::size_t number, const V3i& low) {
         Node& node = tree_.nodes_[lowest_node(low)];
         node.child[BrickTree::entry(low, BrickTree::log2_width)] = static_cast<Child>(number);
-        // The cells just below a side with something on it see that side, so they need bounds of
-        // their own.
+        // The cells just below a side with something on it see that side, so they need
+        // majorants of their own.
         for (unsigned m = 1; m < 8; ++m) {
-            if (sides_[number][m].max > 0) lowest_node(low - side_offset(m));
+            if (sides_[number][m] > 0) lowest_node(low - side_offset(m));
         }
     }
 
@@ -168,7 +156,7 @@ class BrickTreeBuilder {
         }
     }
 
-    /// Computes all bounds, and gives the tree away.
+    /// Computes all majorants, and gives the tree away.
     BrickTree finish(const V3i& low, const V3i& high) {
         using NodeRange = tbb::blocked_range<std::size_t>;
         tbb::parallel_for(NodeRange(0, tree_.nodes_.size()), [&](const NodeRange& range) {
@@ -180,8 +168,7 @@ class BrickTreeBuilder {
         for (std::size_t n = tree_.nodes_.size(); n-- > 0;) {
             if (level_[n] > 1) bound_inner(n);
         }
-        const Range all = range_of(0);
-        tree_.bounds_ = {tree_.scale_ * decode_half(all.min), tree_.scale_ * decode_half(all.max)};
+        tree_.max_ = tree_.scale_ * decode_half(greatest(0));
         tree_.low_ = low;
         tree_.high_ = high;
         tree_.nodes_.shrink_to_fit();
@@ -255,36 +242,36 @@ class BrickTreeBuilder {
         Node& node = tree_.nodes_[n];
         for (int i = 0; i < BrickTree::entries; ++i) {
             const V3i low = low_[n] + V3i((i >> 6) * w, (i >> 3 & 7) * w, (i & 7) * w);
-            Range range;
+            Half greatest = 0;
             for (unsigned m = 0; m < 8; ++m) {
                 const V3i at = low + side_offset(m);
                 const Child found = tree_.contains(at) ? tree_.descend(at) : BrickTree::constant(0);
-                const auto value = static_cast<Half>(found);
-                range.include(found & BrickTree::constant_bit ? Range{value, value}
-                                                              : sides_[found][m]);
+                greatest =
+                    std::max(greatest, found & BrickTree::constant_bit ? static_cast<Half>(found)
+                                                                       : sides_[found][m]);
             }
-            node.min[static_cast<unsigned>(i)] = range.min;
-            node.max[static_cast<unsigned>(i)] = range.max;
+            node.max[static_cast<unsigned>(i)] = greatest;
         }
+        constexpr unsigned even = 0666;  // octal: the first of eight children, an axis a digit
+        node.eight_max.fill(0);
+        for (unsigned i = 0; i < BrickTree::entries; ++i)
+            node.eight_max[i & even] = std::max(node.eight_max[i & even], node.max[i]);
+        for (unsigned i = 0; i < BrickTree::entries; ++i)
+            node.eight_max[i] = node.eight_max[i & even];
     }
 
     void bound_inner(std::size_t n) {
         Node& node = tree_.nodes_[n];
         for (unsigned i = 0; i < BrickTree::entries; ++i) {
             const Child child = node.child[i];
-            const auto value = static_cast<Half>(child);
-            const Range range =
-                child & BrickTree::constant_bit ? Range{value, value} : range_of(child);
-            node.min[i] = range.min;
-            node.max[i] = range.max;
+            node.max[i] =
+                child & BrickTree::constant_bit ? static_cast<Half>(child) : greatest(child);
         }
     }
 
-    Range range_of(std::size_t n) const {
-        const Node& node = tree_.nodes_[n];
-        Range range;
-        for (unsigned i = 0; i < BrickTree::entries; ++i) range.include({node.min[i], node.max[i]});
-        return range;
+    Half greatest(std::size_t n) const {
+        const auto& all = tree_.nodes_[n].max;
+        return *std::max_element(all.begin(), all.end());
     }
 
     BrickTree tree_;

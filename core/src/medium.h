@@ -28,6 +28,7 @@ class Medium {
             }
             const V3d voxels(m[row][0], m[row][1], m[row][2]);  // along one unit of the world
             thickest_ = std::max(thickest_, 1000.0f * static_cast<float>(voxels.length()));
+            longest_ = std::max(longest_, 1.0f / static_cast<float>(voxels.length()));
         }
     }
 
@@ -80,6 +81,13 @@ class Medium {
     /// The majorant of sigma_t where that of the density is given.
     float majorant(float density) const { return bounded(density); }
 
+    /// The boxes that are worth being told apart along a ray: of a fine or thin volume's bricks
+    /// most are crossed without a collision.
+    Boxes boxes() const {
+        const float thickness = majorant(tree_->max()) * longest_ * BrickTree::width;
+        return thickness < 1.5f ? Boxes::eights : Boxes::bricks;
+    }
+
   private:
     /// sigma_t of a density. A thousand mean free paths a voxel are as good as any more, and keep
     /// the work along a ray, and its steps in float, bounded.
@@ -89,6 +97,7 @@ class Medium {
     const BrickTree* tree_;
     float extinction_;
     float thickest_ = 0.0f;
+    float longest_ = 0.0f;  // a voxel's longest side, world units
     Color albedo_;
     HenyeyGreenstein phase_;
     Imath::M33f to_local_;

@@ -95,7 +95,7 @@ struct Workspace {
 
     Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
         : method(make_method(scene, transport)),
-          tracker(std::make_unique<Tracker>(scene.volume->tree())),
+          tracker(std::make_unique<Tracker>(scene.volume->tree(), scene.medium.boxes())),
           kits(std::clamp<std::size_t>(
                    (std::size_t{1} << 16) /
                        (transport.looks.size() *

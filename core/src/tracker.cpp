@@ -72,7 +72,8 @@ std::vector<int> Tracker::widths() {
     return found;
 }
 
-Tracker::Tracker(const BrickTree& tree, int width) : tree_(&tree), follow_(lanes_4::follow) {
+Tracker::Tracker(const BrickTree& tree, Boxes boxes, int width)
+    : tree_(&tree), boxes_(boxes), follow_(lanes_4::follow) {
 #if defined(__x86_64__)
     if (width == 8 && is_small(tree)) follow_ = lanes_8::follow;
     if (width == 16 && is_small(tree)) follow_ = lanes_16::follow;
@@ -82,7 +83,7 @@ Tracker::Tracker(const BrickTree& tree, int width) : tree_(&tree), follow_(lanes
 void Tracker::run() {
     for (std::size_t i = 0; i < waiting_.size(); ++i) {
         if (waiting_[i].empty()) continue;
-        follow_(static_cast<Estimator>(i), *tree_, waiting_[i]);
+        follow_(static_cast<Estimator>(i), *tree_, boxes_, waiting_[i]);
         waiting_[i].clear();
     }
 }

@@ -50,8 +50,9 @@ class Tracker {
     /// How many rays at once this machine can follow, the most last.
     static std::vector<int> widths();
 
-    /// `width` is one of `widths`.
-    explicit Tracker(const BrickTree& tree, int width = widths().back());
+    /// `width` is one of `widths`, and changes nothing of what is found.
+    explicit Tracker(const BrickTree& tree, Boxes boxes = Boxes::bricks,
+                     int width = widths().back());
 
     /// Lays down a ray, which must stay where it is until `run` has returned.
     void add(Estimator estimator, Track& track) {
@@ -64,7 +65,8 @@ class Tracker {
 
   private:
     const BrickTree* tree_;
-    void (*follow_)(Estimator, const BrickTree&, std::span<Track* const>);
+    Boxes boxes_;
+    void (*follow_)(Estimator, const BrickTree&, Boxes, std::span<Track* const>);
     std::array<std::vector<Track*>, 3> waiting_;  // by estimator
 };
 

@@ -70,13 +70,14 @@ void expect_same_field(const FloatGrid& grid, const BuiltTree& built, const Coor
 }
 
 /// The majorant of the cells around a point is the greatest voxel that they can see.
-void expect_exact_majorant(const BrickTree& tree, const V3i& cell, Random& random) {
-    const BrickTree::Cells cells = tree.cells(cell);
+void expect_exact_majorant(const BrickTree& tree, const V3i& cell, Random& random,
+                           Boxes boxes = Boxes::bricks) {
+    const BrickTree::Cells cells = tree.cells(cell, boxes);
     for (int axis = 0; axis < 3; ++axis) {
         ASSERT_LE(cells.low[axis], cell[axis]);
         ASSERT_LT(cell[axis], cells.low[axis] + cells.size);
     }
-    if (cells.size == BrickTree::width) {
+    if (cells.size == BrickTree::width_of(boxes)) {
         float greatest = 0.0f;
         for (int x = 0; x <= cells.size; ++x) {
             for (int y = 0; y <= cells.size; ++y) {
@@ -107,7 +108,8 @@ void expect_exact_majorants(const BrickTree& tree, int cells, std::uint64_t key)
         for (int axis = 0; axis < 3; ++axis) {
             cell[axis] = tree.low()[axis] + draw(random, tree.high()[axis] - tree.low()[axis]);
         }
-        expect_exact_majorant(tree, cell, random);
+        for (const Boxes boxes : {Boxes::bricks, Boxes::eights})
+            expect_exact_majorant(tree, cell, random, boxes);
         if (testing::Test::HasFatalFailure()) return;
     }
 }
@@ -151,8 +153,7 @@ TEST(BrickTree, MajorantsAreTheGreatestVoxelSeen) {
         expect_exact_majorants(built.tree, 4000, key);
         float greatest = 0.0f;
         for (auto it = grid->tree().cbeginValueAll(); it; ++it) greatest = std::max(greatest, *it);
-        EXPECT_NEAR(built.tree.bounds().max, greatest, greatest * 0x1p-11);
-        EXPECT_EQ(built.tree.bounds().min, 0.0f);
+        EXPECT_NEAR(built.tree.max(), greatest, greatest * 0x1p-11);
     }
 }
 
@@ -273,7 +274,7 @@ TEST(BrickTree, CountsWhatCannotBeADensityAndTakesItAsZero) {
         const V3i local = V3i(x, 0, 0) - built.origin;
         EXPECT_EQ(built.tree.voxel(local), x == 0 ? 1.0f : 0.0f) << x;
     }
-    EXPECT_EQ(built.tree.bounds().max, 1.0f);
+    EXPECT_EQ(built.tree.max(), 1.0f);
 }
 
 TEST(BrickTree, GridsThatHoldNothingAreEmpty) {
@@ -341,7 +342,7 @@ TEST(BrickTree, KeepsThePrecisionOfExtremeValues) {
 /// and leave out only what is empty.
 void expect_segments_cover(const BrickTree& tree, const LocalRay& ray) {
     // Rounding of a position, times the steepest slope the field can have.
-    const float slack = 2e-4f * tree.bounds().max;
+    const float slack = 2e-4f * tree.max();
     const float speed = ray.direction.length();
     float reach = 0.0f;
     for (int corner = 0; corner < 8; ++corner) {

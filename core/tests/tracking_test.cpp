@@ -44,11 +44,21 @@ class TrackingTest : public testing::Test {
                test::optical_depth(volume_->tree(), V3d(r.origin), V3d(r.direction), begin, end);
     }
 
+    static constexpr double everything = 20.0;  // world units: beyond the volume for all the rays
+    int tests() const { return static_cast<int>(rays_.size()); }
+
+    std::shared_ptr<const Volume> volume_;
+    std::optional<Medium> medium_;
+    std::vector<LocalRay> rays_;
+};
+
+class TrackerTest : public TrackingTest, public testing::WithParamInterface<Boxes> {
+  protected:
     /// What so many tracks like this one find, each by random numbers of its own.
-    std::vector<Track> follow(Estimator estimator, const Track& like, int count, std::uint64_t key,
-                              int width = Tracker::widths().back()) const {
+    std::vector<Track> follow(Estimator estimator, const Track& like, int count,
+                              std::uint64_t key) const {
         std::vector<Track> tracks(static_cast<std::size_t>(count), like);
-        Tracker tracker(volume_->tree(), width);
+        Tracker tracker(volume_->tree(), GetParam());
         for (std::size_t i = 0; i < tracks.size(); ++i) {
             Track& track = tracks[i];
             track.random = Random(hash_key(key, i));
@@ -68,16 +78,14 @@ class TrackingTest : public testing::Test {
                 .power = power,
                 .rate = rate};
     }
-
-    static constexpr double everything = 20.0;  // world units: beyond the volume for all the rays
-    int tests() const { return static_cast<int>(rays_.size()); }
-
-    std::shared_ptr<const Volume> volume_;
-    std::optional<Medium> medium_;
-    std::vector<LocalRay> rays_;
 };
 
-TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
+INSTANTIATE_TEST_SUITE_P(In, TrackerTest, testing::Values(Boxes::bricks, Boxes::eights),
+                         [](const testing::TestParamInfo<Boxes>& info) {
+                             return info.param == Boxes::bricks ? "Bricks" : "Eights";
+                         });
+
+TEST_P(TrackerTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
     constexpr int samples = 200000, bins = 40;
     for (std::size_t r = 0; r < rays_.size(); ++r) {
         const LocalRay& way = rays_[r];
@@ -111,7 +119,7 @@ TEST_F(TrackingTest, DeltaTrackingFollowsTransmittanceTimesExtinction) {
     }
 }
 
-TEST_F(TrackingTest, ForcedCollisionsFollowTransmittanceTimesExtinctionByWeight) {
+TEST_P(TrackerTest, ForcedCollisionsFollowTransmittanceTimesExtinctionByWeight) {
     constexpr int samples = 200000;
     constexpr std::array<double, 4> ends{0.6, 1.2, 2.4, everything};
     const Medium thin(*volume_, 0.01f, Color(1.0f), 0.0f);
@@ -137,7 +145,7 @@ TEST_F(TrackingTest, ForcedCollisionsFollowTransmittanceTimesExtinctionByWeight)
     }
 }
 
-TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
+TEST_P(TrackerTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
     constexpr int samples = 200000;
     constexpr std::array<float, 5> powers{1.0f, 0.5f, 0.1f, 1e-6f, 0.0f};
     for (std::size_t r = 0; r < rays_.size(); ++r) {
@@ -160,7 +168,7 @@ TEST_F(TrackingTest, RatioTrackingHasEveryPowerOfTheTransmittanceAsItsMean) {
     }
 }
 
-TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
+TEST_P(TrackerTest, ThickMediaEndEstimatesWithoutBias) {
     // Optical depths of hundreds: nearly all estimates end early, by roulette.
     const Medium thick(*volume_, 60.0f, Color(1.0f), 0.0f);
     for (const LocalRay& way : rays_) {
@@ -176,14 +184,14 @@ TEST_F(TrackingTest, ThickMediaEndEstimatesWithoutBias) {
     }
 }
 
-TEST_F(TrackingTest, AMediumWithoutExtinctionIsNoObstacle) {
+TEST_P(TrackerTest, AMediumWithoutExtinctionIsNoObstacle) {
     const Medium clear(*volume_, 0.0f, Color(1.0f), 0.0f);
     for (const LocalRay& way : rays_) {
         // A flight of no length through it is the one in 2^24 that could find no end.
         Track flight = along(clear, way), light = flight,
               faint = along(*medium_, way, 1.0f, 1e-45f), none = along(*medium_, way, 1.0f, 0.0f);
         faint.first = 0.5f;
-        Tracker tracker(volume_->tree());
+        Tracker tracker(volume_->tree(), GetParam());
         tracker.add(Estimator::collision, flight);
         for (Track* const track : {&light, &faint, &none})
             tracker.add(Estimator::transmittance, *track);
@@ -195,7 +203,7 @@ TEST_F(TrackingTest, AMediumWithoutExtinctionIsNoObstacle) {
     }
 }
 
-TEST_F(TrackingTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
+TEST_P(TrackerTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
     // Five media, so that no two neighbouring lanes have the same work.
     std::vector<Medium> media;
     for (int i = 0; i < 5; ++i)
@@ -211,13 +219,13 @@ TEST_F(TrackingTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
         }
         std::vector<Track> alone = tracks;
         for (Track& track : alone) {
-            Tracker tracker(volume_->tree(), 4);
+            Tracker tracker(volume_->tree(), GetParam(), 4);
             tracker.add(estimator, track);
             tracker.run();
         }
         for (const int width : Tracker::widths()) {
             std::vector<Track> together = tracks;
-            Tracker tracker(volume_->tree(), width);
+            Tracker tracker(volume_->tree(), GetParam(), width);
             for (Track& track : together) tracker.add(estimator, track);
             tracker.run();
             for (std::size_t i = 0; i < tracks.size(); ++i) {

@@ -100,7 +100,7 @@ class Tracked final : public Method {
     static float first_rate(const Scene& scene) {
         const auto bounds = scene.volume->world_bounds();
         if (!bounds) return 1.0f;
-        const double thickness = scene.medium.majorant(scene.volume->tree().bounds().max) *
+        const double thickness = scene.medium.majorant(scene.volume->tree().max()) *
                                  (bounds->second - bounds->first).length();
         return static_cast<float>(std::clamp(4.0 / thickness, 1.0, 8.0));
     }
