@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 namespace pileus {
 
@@ -123,25 +124,37 @@ void trace(Workspace& work, const Scene& scene, const Control& control) {
     if (work.records.size() < work.samples.size())
         work.records.resize(work.samples.size(), work.blank);
     std::vector<Path> paths(work.kits.size());
+    std::vector<std::size_t> idle(paths.size()), flying;
+    std::iota(idle.begin(), idle.end(), std::size_t{0});
     std::size_t next = 0;
-    const auto goes_on = [&](std::size_t slot) {
-        while (!paths[slot].resume()) {
-            if (next == work.samples.size()) return false;
+    const auto start = [&] {
+        while (!idle.empty() && next < work.samples.size()) {
             const Sample& sample = work.samples[next];
             PathRecord& record = work.records[next++];
             record.clear();
-            if (sample.ray.volume)
-                paths[slot] =
-                    work.method->trace(sample.ray, sample.random, record, work.kits[slot]);
+            if (!sample.ray.volume) continue;
+            const std::size_t slot = idle.back();
+            paths[slot] = work.method->trace(sample.ray, sample.random, record, work.kits[slot]);
+            if (!paths[slot].resume()) continue;
+            idle.pop_back();
+            flying.push_back(slot);
         }
-        return true;
     };
-    for (std::size_t flying = paths.size(); flying > 0;) {
+    do {
         if (control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
-        flying = 0;
-        for (std::size_t slot = 0; slot < paths.size(); ++slot) flying += goes_on(slot) ? 1 : 0;
+        // Many at once, so that camera rays, too, fill the lanes.
+        if (4 * idle.size() >= paths.size()) start();
         work.tracker->run();
-    }
+        auto kept = flying.begin();
+        for (const std::size_t slot : flying) {
+            if (paths[slot].resume()) {
+                *kept++ = slot;
+            } else {
+                idle.push_back(slot);
+            }
+        }
+        flying.erase(kept, flying.end());
+    } while (!flying.empty() || next < work.samples.size());
     if (!scene.background) return;
     for (std::size_t i = 0; i < work.samples.size(); ++i) {
         PathRecord& record = work.records[i];
