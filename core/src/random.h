@@ -57,6 +57,15 @@ namespace sobol {
 
 constexpr int dimensions = 4;
 
+template <class Word>
+constexpr Word reverse_bits(Word x) {
+    x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
+    x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
+    x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
+    x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
+    return (x >> 16) | (x << 16);
+}
+
 /// Direction numbers of the first four dimensions, from Joe & Kuo's primitive polynomials (2008).
 constexpr std::array<std::array<std::uint32_t, 32>, dimensions> direction_numbers() {
     struct Polynomial {
@@ -86,29 +95,19 @@ constexpr std::array<std::array<std::uint32_t, 32>, dimensions> direction_number
 /// Four words, for arithmetic on all dimensions at once (GCC's and Clang's vectors).
 using Words = std::uint32_t __attribute__((vector_size(16)));
 
-template <class Word>
-constexpr Word reverse_bits(Word x) {
-    x = ((x >> 1) & 0x55555555u) | ((x & 0x55555555u) << 1);
-    x = ((x >> 2) & 0x33333333u) | ((x & 0x33333333u) << 2);
-    x = ((x >> 4) & 0x0f0f0f0fu) | ((x & 0x0f0f0f0fu) << 4);
-    x = ((x >> 8) & 0x00ff00ffu) | ((x & 0x00ff00ffu) << 8);
-    return (x >> 16) | (x << 16);
-}
-
-/// A nested uniform (Owen) scramble of x: each bit is flipped by a hash of the bits above it.
+/// A nested uniform (Owen) scramble of a mirrored word, its highest bit the least: each bit is
+/// flipped by a hash of those below it.
 template <class Word>
 constexpr Word owen_scramble(Word x, Word seed) {
-    x = reverse_bits(x);
     x ^= x * 0x3d20adeau;
     x += seed;
     x *= (seed >> 16) | 1u;
     x ^= x * 0x05526c56u;
-    x ^= x * 0x53a22864u;
-    return reverse_bits(x);
+    return x ^ (x * 0x53a22864u);
 }
 
-/// The sum of direction numbers for each value of each byte of an index: a point takes four
-/// look-ups.
+/// The sum of direction numbers for each value of each byte of an index, both mirrored: a point
+/// takes four look-ups.
 struct ByteTable {
     alignas(16) std::array<std::array<std::array<std::uint32_t, dimensions>, 256>, 4> sums{};
 
@@ -118,8 +117,8 @@ struct ByteTable {
             for (unsigned value = 1; value < 256; ++value) {
                 const auto lowest = static_cast<unsigned>(std::countr_zero(value));
                 for (unsigned d = 0; d < dimensions; ++d) {
-                    sums[byte][value][d] =
-                        sums[byte][value & (value - 1)][d] ^ directions[d][8 * byte + lowest];
+                    sums[byte][value][d] = sums[byte][value & (value - 1)][d] ^
+                                           reverse_bits(directions[d][31 - (8 * byte + lowest)]);
                 }
             }
         }
@@ -137,13 +136,14 @@ struct ByteTable {
 /// dimensions.
 inline std::array<float, dimensions> point(std::uint32_t index, std::uint64_t key) {
     static constexpr ByteTable table;
-    const std::uint32_t shuffled = owen_scramble(index, static_cast<std::uint32_t>(mix64(key)));
+    const std::uint32_t shuffled =
+        owen_scramble(reverse_bits(index), static_cast<std::uint32_t>(mix64(key)));
     const Words x =
         table(0, shuffled) ^ table(1, shuffled) ^ table(2, shuffled) ^ table(3, shuffled);
     const std::uint64_t low = hash_key(key, 1), high = hash_key(key, 2);
     const Words seeds{static_cast<std::uint32_t>(low), static_cast<std::uint32_t>(low >> 32),
                       static_cast<std::uint32_t>(high), static_cast<std::uint32_t>(high >> 32)};
-    const Words scrambled = owen_scramble(x, seeds);
+    const Words scrambled = reverse_bits(owen_scramble(x, seeds));
     std::array<float, dimensions> result{};
     for (int d = 0; d < dimensions; ++d)
         result[static_cast<unsigned>(d)] = unit_float(scrambled[d]);
