@@ -2,6 +2,7 @@
 costs no worker. A few hundred here, 10,000 in the slow tier."""
 
 import random
+import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -75,6 +76,39 @@ def test_ten_thousand_mutants(
     # Where these cannot be made, the other kinds of file are still read.
     more = request.getfixturevalue("odd_caches") if suffix == ".vdb" else []
     look_through(reader, tmp_path, suffix, count, seed, more)
+
+
+@pytest.mark.slow
+def test_mutants_of_images_that_coverage_guides(tmp_path: Path) -> None:
+    """libFuzzer keeps the mutants that reach code which none before has, and mutates those."""
+    if shutil.which("clang++") is None:
+        pytest.skip("needs clang (`make test-slow` installs it)")
+    core_folder = Path(hostile.__file__).parents[1] / "core"
+    build, corpus = tmp_path / "build", tmp_path / "corpus"
+    for command in (
+        ["cmake", "-S", core_folder, "-B", build, "-G", "Ninja", "-DCMAKE_CXX_COMPILER=clang++"],
+        ["cmake", "--build", build, "--target", "fuzz_read_images"],
+    ):
+        subprocess.run(command, check=True, capture_output=True)
+    corpus.mkdir()
+    for number, image in enumerate(seeds(tmp_path)[".exr"]):
+        (corpus / str(number)).write_bytes(image)
+    told = subprocess.run(
+        # A mutant that takes long is not wrong: OpenEXR's own searches of a spoiled file are.
+        [
+            *(build / "fuzz_read_images", corpus, "-runs=10000", "-seed=1", "-max_len=8192"),
+            *("-use_value_profile=1", "-timeout=120", "-rss_limit_mb=0", "-malloc_limit_mb=0"),
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=1800,
+    )
+    assert told.returncode == 0, told.stderr[-3000:]
+    assert "Done 10000 runs" in told.stderr
+    # It was guided: the corpus has grown.
+    assert len(list(corpus.iterdir())) > 100
 
 
 def test_what_python_would_not_print_is_shown_escaped_in_an_error(tmp_path: Path) -> None:
