@@ -299,9 +299,14 @@ class Queue:
 
     # The workers' side.
 
-    def claim(self, info: WorkerInfo) -> Task | None:
-        """The next task for a worker, or None; says that the worker lives either way."""
-        found = self._run("claim", info.name, info.model_dump_json())
+    def claim(self, info: WorkerInfo, *, able: bool = True, trouble: str = "") -> Task | None:
+        """The next task for a worker, or None; says that the worker lives either way.
+
+        One that is not `able` to do a task gets none, and is shown as set aside while it has
+        `trouble`.
+        """
+        reason = printable(trouble)[:500]
+        found = self._run("claim", info.name, info.model_dump_json(), int(able), reason)
         if not found:
             return None
         priority, entry, attempt, job, frame, kind, part = found

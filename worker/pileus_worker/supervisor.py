@@ -217,23 +217,23 @@ class Supervisor:
         structlog.contextvars.bind_contextvars(worker=self.info.name)
         try:
             while not ending.asked.is_set():
-                if not self._ready(ending):
-                    continue
+                able, trouble = self._readiness()
                 asked_at = time.monotonic()
                 try:
                     if self._owed is not None:
                         self._queue.hand_back(self._owed, self.info.name)
                         self._owed = None
-                    task = self._queue.claim(self.info)
+                    task = self._queue.claim(self.info, able=able, trouble=trouble)
                     self._away = False
                 except RedisError as error:
                     # Away, loading, or its disk is full: it comes back, and we are here then.
                     log.warning("no tasks to be had", reason=str(error))
                     task, self._away = None, True
-                if task is None:
-                    ending.asked.wait(IDLE * random.uniform(0.5, 1.5))
-                else:
+                if task is not None:
                     self._attempt(task, asked_at, ending)
+                elif able or trouble:
+                    wait = PATIENCE if trouble else IDLE
+                    ending.asked.wait(wait * random.uniform(0.5, 1.5))
             try:
                 if not self._away:
                     self._queue.leave(self.info.name)
@@ -242,18 +242,18 @@ class Supervisor:
         finally:
             self._drop_child()
 
-    def _ready(self, ending: Ending) -> bool:
-        """Whether the child can do a task at once: none is claimed for one that still starts, which
-        would hold it up for seconds, and its end in that time would count as the task's attempt."""
+    def _readiness(self) -> tuple[bool, str]:
+        """Whether the child can do a task at once, and if it cannot start, why. None is claimed for
+        one that still starts, which would hold it up for seconds, and its end in that time would
+        count as the task's attempt."""
         try:
             if self._child is None:
                 self._child = Child(self._setup, self._output)
-            return self._child.ready(IDLE)
+            return self._child.ready(IDLE), ""
         except (ChildLostError, OSError) as error:
             self._drop_child()
             log.warning("no render process", reason=str(error), output=self._output.take())
-            ending.asked.wait(PATIENCE)
-            return False
+            return False, f"its render process does not start: {error}"
 
     def _attempt(self, task: Task, leased: float, ending: Ending) -> None:
         """Does a task whose lease began at `leased`, and says how that went."""

@@ -1,10 +1,6 @@
 -- Put after issue.lua: attempts that failed, what they lead to, and workers on which all fail.
 
 local ATTEMPTS = 3
--- A lost lease says more of the worker than of its task, and hosts die in numbers: a task that takes its
--- host with it is parked in the end, but one that was unlucky has more chances.
-local LOSSES = 6
-local LOST = 'stopped answering'
 local STRIKES = 3 -- tasks that failed on a worker and then went well on another
 local ASIDE = 300000 -- milliseconds for which such a worker gets nothing
 
@@ -12,6 +8,12 @@ local ASIDE = 300000 -- milliseconds for which such a worker gets nothing
 local function aside(worker)
   local until_then = redis.call('ZSCORE', 'pileus:aside', worker)
   return until_then and (until_then == 'inf' or tonumber(until_then) > now())
+end
+
+local function set_aside(worker, milliseconds, reason)
+  if aside(worker) then return end
+  redis.call('ZADD', 'pileus:aside', now() + milliseconds, worker)
+  redis.call('HSET', 'pileus:aside:why', worker, reason)
 end
 
 local function live_workers()
@@ -32,18 +34,15 @@ end
 -- What an attempt's failure leads to for the worker that asks: 'take', 'skip' or 'park'.
 -- The delivery count is the attempt count. The attempts go to distinct workers while such live.
 local function verdict(stream, id, task, deliveries, worker)
-  local tries, lost = tries_of(stream, id), 0
-  for _, reason in pairs(paired(redis.call('HGETALL', tries))) do
-    if reason == LOST then lost = lost + 1 end
-  end
-  if redis.call('HLEN', tries) - lost >= ATTEMPTS or lost >= LOSSES then return 'park' end
+  local tries = tries_of(stream, id)
+  if redis.call('HLEN', tries) >= ATTEMPTS then return 'park' end
   if redis.call('HEXISTS', tries, worker) == 0 then return 'take' end
   for _, other in ipairs(live_workers()) do
     if redis.call('HEXISTS', tries, other) == 0 and not aside(other) and suits(task, other) then
       return 'skip'
     end
   end
-  return deliveries - lost >= ATTEMPTS and 'park' or 'take'
+  return deliveries >= ATTEMPTS and 'park' or 'take'
 end
 
 local function record_try(stream, id, worker, reason)
@@ -58,8 +57,7 @@ local function blame(stream, id, worker)
   for other, reason in pairs(paired(redis.call('HGETALL', tries_of(stream, id)))) do
     if other ~= worker and redis.call('HINCRBY', 'pileus:strikes', other, 1) >= STRIKES then
       redis.call('HDEL', 'pileus:strikes', other)
-      redis.call('ZADD', 'pileus:aside', 'NX', now() + ASIDE, other)
-      redis.call('HSET', 'pileus:aside:why', other,
+      set_aside(other, ASIDE,
         STRIKES .. ' tasks failed here and went well elsewhere; the last: ' .. reason)
       count('workers_set_aside')
     end

@@ -1,7 +1,9 @@
 -- Gives the worker ARGV[2] (described by ARGV[3]) its next task: by priority, and in each stream
 -- those whose lease ran out before new ones. Returns {priority, id, attempt, job, frame, kind, part}.
+-- A worker that is not able to do one (ARGV[4] is not 1) gets none; ARGV[5] is its trouble, if it has any.
 local SWEEP = 250 -- milliseconds between looks for leases that ran out
-local worker, info = ARGV[2], ARGV[3]
+local TROUBLED = 3000 -- milliseconds for which a worker with trouble is set aside, and each time again
+local worker, info, able, trouble = ARGV[2], ARGV[3], ARGV[4], ARGV[5]
 
 local function each_stream(act)
   for priority = 9, 0, -1 do
@@ -47,7 +49,7 @@ local function take_expired()
   each_stream(function(stream)
     each_pending(stream, LEASE, function(id, owner)
       if owner == RELEASED then return end
-      record_try(stream, id, owner, LOST)
+      record_try(stream, id, owner, 'stopped answering')
       count('leases_lost')
       redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'JUSTID')
       local task = read(stream, id)
@@ -151,7 +153,8 @@ end
 
 look_around()
 greet(worker, info)
-if aside(worker) then return nil end
+if trouble ~= '' then set_aside(worker, TROUBLED, trouble) end
+if able ~= '1' or aside(worker) then return nil end
 for priority = 9, 0, -1 do
   local stream = stream_of(priority)
   if redis.call('EXISTS', stream) == 1 then
