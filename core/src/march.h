@@ -13,10 +13,10 @@ namespace pileus {
 
 class DensityMarch {
   public:
-    /// Marches the ray in steps of at most one voxel, or longer ones as long as they are thin. The
-    /// steps between two majorants are all read at the same fraction of their length; that of the
-    /// first is `jitter` in [0, 1), and the next ones are stratified (by the golden ratio), for
-    /// long steps could else keep in step with a pattern of voxels.
+    /// Marches the ray in steps of at most one voxel, or longer ones as long as they are thin. All
+    /// are read at the same fraction of their length, `jitter` in [0, 1), but that after long ones
+    /// it moves on by the golden ratio with each majorant: they could else keep in step with a
+    /// pattern of voxels.
     void march(const Medium& medium, const LocalRay& ray, float jitter) {
         steps_.clear();
         const float speed = std::max(
@@ -40,8 +40,7 @@ class DensityMarch {
                 steps_.push_back({long_steps ? read : t, long_steps ? 0.0f : 1.0f / sigma, depth_});
                 depth_ += sigma * dt;
             }
-            jitter += 0.618034f;
-            if (jitter >= 1.0f) jitter -= 1.0f;
+            if (long_steps) jitter += jitter < 1.0f - golden ? golden : golden - 1.0f;
         }
     }
 
@@ -73,6 +72,7 @@ class DensityMarch {
     // Optical depth of a long step under the majorant: the cost then follows the light, not the
     // voxels.
     static constexpr float thin = 0.2f;
+    static constexpr float golden = 0.618034f;
 
     std::vector<Step> steps_;
     float depth_ = 0.0f;
