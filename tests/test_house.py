@@ -1,9 +1,17 @@
 """The house's rules that a reviewer would otherwise have to keep in mind."""
 
 import ast
+import pickle
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from pileus_service.jobs import Cause, Merged, Planned, Rendered, Replan, Stale, Waiting
+from pileus_worker import supervisor
+from pileus_worker.child import MESSAGE, Beat, Failed, Finished, Message, Ready, Spent
 
 
 def test_the_service_needs_neither_worker_nor_core() -> None:
@@ -32,6 +40,7 @@ main()
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.returncode == 1
+    assert "pileus_core" in ended.stderr
     assert "pip install" in ended.stderr
     assert "Traceback" not in ended.stderr
 
@@ -52,3 +61,32 @@ def test_nothing_that_a_client_sends_can_become_code() -> None:
                 case _:
                     continue
             assert not used & barred, f"{file}:{node.lineno}"
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Beat(7),
+        Ready(),
+        Failed("out of memory", Cause.MEMORY, Spent(1.5, 3, {"read": 0.25})),
+        *(
+            Finished(result, Spent())
+            for result in (
+                Planned(tasks=2, finished=[1], total=2, samples=9),
+                Rendered(samples=4, taken=3),
+                Merged(),
+                Merged(redo=[3], reason="damaged"),
+                Replan(),
+                Waiting(wait="no such file"),
+                Stale(stale="another size"),
+            )
+        ),
+    ],
+    ids=lambda message: type(getattr(message, "result", message)).__name__,
+)
+def test_a_render_child_is_heard_as_it_spoke_and_only_in_json(message: Message) -> None:
+    assert MESSAGE.validate_json(MESSAGE.dump_json(message)) == message
+    with pytest.raises(ValidationError):
+        MESSAGE.validate_json(pickle.dumps(message))
+    # Connection.recv would unpickle.
+    assert ".recv(" not in Path(supervisor.__file__).read_text()

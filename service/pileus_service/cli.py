@@ -34,17 +34,18 @@ class Commands(TyperGroup):
 
 
 def _absent(name: str, error: ImportError) -> typer.Typer:
-    """Stands for a command whose package is not here, and says what to install."""
+    """Stands for a command that something is missing for, and says what and what to install."""
     stub = typer.Typer()
 
     @stub.command(
         name,
-        help="Needs the renderer, which is not installed.",
+        help=f"Cannot start here: {error}.",
         context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     )
     def explain() -> None:
         raise FarmError(
-            f"pileus {name} needs the renderer: pip install ./core 'pileus[worker]' ({error})"
+            f"pileus {name} cannot start: {error}. What renders needs pip install ./core "
+            "'pileus[worker]', and the chart 'pileus[bench]' as well"
         )
 
     return stub

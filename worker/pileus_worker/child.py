@@ -16,8 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from pydantic import Field, TypeAdapter
+
+from pileus_service.errors import printable
 from pileus_service.jobs import Cause, Job, Kind, Result
 from pileus_worker.paths import PathMap
 
@@ -70,6 +73,7 @@ class Beat:
     """The child lives, and has done so many pixel samples of its task."""
 
     samples: int
+    says: Literal["beat"] = "beat"
 
 
 @dataclass(frozen=True)
@@ -85,11 +89,14 @@ class Spent:
 class Ready:
     """A frame is whole, and waits for a Permit."""
 
+    says: Literal["ready"] = "ready"
+
 
 @dataclass(frozen=True)
 class Finished:
     result: Result
     spent: Spent
+    says: Literal["finished"] = "finished"
 
 
 @dataclass(frozen=True)
@@ -97,9 +104,14 @@ class Failed:
     reason: str
     cause: Cause
     spent: Spent = Spent()
+    says: Literal["failed"] = "failed"
 
 
-Message = Beat | Ready | Finished | Failed
+# What the child says goes as JSON: it has read files that nobody vouches for, and must not be able
+# to make its parent run anything.
+Message = Annotated[Beat | Ready | Finished | Failed, Field(discriminator="says")]
+MESSAGE: TypeAdapter[Message] = TypeAdapter(Message)
+LONGEST_MESSAGE = 16 << 20
 
 
 def run(pipe: "Connection[Any, Any]", output: "Connection[Any, Any]", setup: Setup) -> None:
@@ -131,8 +143,8 @@ def _outcome(work: "Work", spent: Callable[[], Spent]) -> Finished | Failed:
     except Exception as error:
         for kind, cause in causes:
             if isinstance(error, kind):
-                return Failed(str(error), cause, spent())
-        return Failed(f"{type(error).__name__}: {error}", Cause.ERROR, spent())
+                return Failed(printable(str(error)), cause, spent())
+        return Failed(printable(f"{type(error).__name__}: {error}"), Cause.ERROR, spent())
 
 
 def _limit(setup: Setup) -> None:
@@ -234,4 +246,4 @@ class Life:
 
     def _say(self, message: Message) -> None:
         with self._saying:
-            self._pipe.send(message)
+            self._pipe.send_bytes(MESSAGE.dump_json(message))

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import structlog
+from pydantic import ValidationError
 from redis.exceptions import RedisError
 from tenacity import (
     RetryError,
@@ -126,9 +127,11 @@ class Child:
         """What the child says within a time, or None."""
         try:
             if self._pipe.poll(seconds):
-                message: child.Message = self._pipe.recv()
+                message = child.MESSAGE.validate_json(self._pipe.recv_bytes(child.LONGEST_MESSAGE))
                 self._heard, self._silence, self._started = time.monotonic(), SILENCE, True
                 return message
+        except ValidationError:
+            raise ChildLostError("the render process said what none of ours does") from None
         except (EOFError, OSError):
             raise ChildLostError(self._how_it_ended()) from None
         if time.monotonic() - self._heard > self._silence:
