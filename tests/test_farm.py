@@ -168,6 +168,17 @@ def test_killed_workers_change_no_bit(
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
+def test_what_a_killed_writer_left_is_swept_with_its_frame(
+    farm: EmbeddedFarm, client: Client, long_shot: Shot, tmp_path: Path
+) -> None:
+    job = client.submit(long_shot).job.id
+    folder = tmp_path / "farm" / "jobs" / job / "frames" / "000001"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / ".plan.json.1.0").write_text('{"half')
+    finish(client, job)
+    assert not list(folder.glob(".*"))
+
+
 @pytest.mark.parametrize("loss", ["emptied", "killed"])
 def test_a_lost_redis_loses_nothing_and_renders_nothing_twice(
     farm: EmbeddedFarm, client: Client, long_shot: Shot, tmp_path: Path, loss: str

@@ -107,6 +107,12 @@ class FrameStore:
     def drop_parts(self) -> None:
         shutil.rmtree(self.folder / "parts", ignore_errors=True)
 
+    def sweep(self) -> None:
+        """Removes the partials, and what was being written here when its writer was killed."""
+        self.drop_parts()
+        for temporary in self.folder.glob(".*"):
+            temporary.unlink(missing_ok=True)
+
 
 class Store:
     """The data folder, shared by the service and all workers."""

@@ -283,7 +283,7 @@ class Work:
 
     def _tidy(self, files: FrameStore) -> None:
         """Sweeps, once the frame is done, what its attempts have left."""
-        files.drop_parts()
+        files.sweep()
         shutil.rmtree(self._staging, ignore_errors=True)
 
     def _scene(self, read: list[Cache]) -> core.Scene:
