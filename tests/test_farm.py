@@ -44,7 +44,7 @@ def real_shot(shot: dict[str, Any], caches: Path) -> Shot:
     """Small, and yet several buckets and sample ranges a frame where tasks are planned short."""
     shot["volumes"][0]["cache"] = str(caches / "cloud.####.vdb")
     shot["image"] |= {"width": 64, "height": 48}
-    shot["sampling"]["samples"] = 24
+    shot["sampling"]["samples"] = 96
     return Shot.model_validate(shot)
 
 
