@@ -43,15 +43,15 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def real_shot(shot: dict[str, Any], caches: Path) -> Shot:
     """Small, and yet several buckets and sample ranges a frame where tasks are planned short."""
     shot["volumes"][0]["cache"] = str(caches / "cloud.####.vdb")
-    shot["image"] |= {"width": 64, "height": 48}
-    shot["sampling"]["samples"] = 96
+    shot["image"] |= {"width": 128, "height": 96}
+    shot["sampling"]["samples"] = 24
     return Shot.model_validate(shot)
 
 
 @pytest.fixture
 def long_shot(real_shot: Shot) -> Shot:
     """One frame that takes seconds, so that something can happen to it."""
-    sampling = real_shot.sampling.model_copy(update={"samples": 600})
+    sampling = real_shot.sampling.model_copy(update={"samples": 150})
     return real_shot.model_copy(update={"frames": "1", "sampling": sampling})
 
 
