@@ -89,6 +89,19 @@ def test_a_child_that_dies_while_it_starts_costs_no_attempt(
         assert farm.queue.stats().get("attempts_failed", 0) == 0
 
 
+def test_a_child_that_dies_at_rest_keeps_its_worker_from_nothing(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    with Farm(tmp_path, [tmp_path], 1) as farm:
+        assert ended(farm, farm.client.submit(cached_shot).job.id).state == "done"
+        [worker] = farm.workers
+        before = worker.children
+        child = before[-1]  # multiprocessing's own helper comes first
+        os.kill(child, signal.SIGKILL)
+        until(lambda: len(worker.children) == len(before) and child not in worker.children)
+        assert [seen.aside for seen in farm.queue.workers()] == [None]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", [False, True], ids=["supervisor", "supervisor and child"])
 def test_a_thawed_worker_changes_nothing(cached_shot: Shot, tmp_path: Path, whole: bool) -> None:

@@ -45,6 +45,7 @@ log = structlog.stdlib.get_logger(__name__)
 IDLE = 0.2
 LOOK = 0.5
 SILENCE = 30.0
+FALSE_STARTS = 3  # in a row: then it is no accident that the child does not start
 PATIENCE = 1.0
 # After these a child is replaced, and they may be the fault of a cache that was read ahead.
 UNSOUND = (Cause.CRASH, Cause.HANG, Cause.MEMORY)
@@ -207,6 +208,7 @@ class Supervisor:
             started=time.time(),
         )
         self._child: Child | None = None
+        self._false_starts = 0  # of children, in a row
         self._output = Output()
         # What was dropped while Redis was away, to be handed back when it is there again.
         self._owed: Task | None = None
@@ -246,16 +248,21 @@ class Supervisor:
             self._drop_child()
 
     def _readiness(self) -> tuple[bool, str]:
-        """Whether the child can do a task at once, and if it cannot start, why. None is claimed for
-        one that still starts, which would hold it up for seconds, and its end in that time would
-        count as the task's attempt."""
+        """Whether the child can do a task at once, and if none will start, why. No task is claimed
+        for one that still starts, which would hold it up for seconds, and its end in that time
+        would count as the task's attempt."""
         try:
             if self._child is None:
+                self._false_starts += 1
                 self._child = Child(self._setup, self._output)
-            return self._child.ready(IDLE), ""
+            if ready := self._child.ready(IDLE):
+                self._false_starts = 0
+            return ready, ""
         except (ChildLostError, OSError) as error:
             self._drop_child()
             log.warning("no render process", reason=str(error), output=self._output.take())
+            if self._false_starts < FALSE_STARTS:
+                return False, ""
             return False, f"its render process does not start: {error}"
 
     def _attempt(self, task: Task, leased: float, ending: Ending) -> None:
