@@ -26,7 +26,7 @@ LEASE = 2.0
 
 
 def worker(name: str) -> WorkerInfo:
-    return WorkerInfo(name=name, host="host", pid=1, threads=1, started=0.0)
+    return WorkerInfo(name=name, host="host", pid=1, threads=1, started=1764095323.25)
 
 
 A, B, C, D = (worker(name) for name in "ABCD")
@@ -425,6 +425,18 @@ def test_a_worker_that_is_not_able_gets_nothing_and_with_trouble_is_not_waited_f
     assert [view.aside for view in queue.workers()] == [None, "no memory"]
     queue.fail(task, "A", "bad")
     assert take(queue, A).entry == task.entry
+
+
+def test_a_worker_is_shown_at_its_task_from_claim_to_claim(queue: Queue) -> None:
+    submit(queue)
+    task = take(queue)
+    [shown] = queue.workers()
+    assert (shown.task, shown.started) == (task, A.started)
+    do(queue, task)
+    queue.drain(A.name)
+    assert queue.claim(A) is None
+    [shown] = queue.workers()
+    assert shown.task is None
 
 
 def test_a_drained_worker_gets_nothing_until_it_is_told_otherwise(queue: Queue) -> None:

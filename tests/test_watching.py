@@ -55,7 +55,7 @@ def one_frame(shot: dict[str, Any], tmp_path: Path) -> Shot:
 
 @pytest.fixture
 def farm(tmp_path: Path) -> Iterator[EmbeddedFarm]:
-    with embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0", 0.2) as farm:
+    with embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0") as farm:
         yield farm
 
 

@@ -83,8 +83,18 @@ local function look_around()
   wake(time)
 end
 
+-- The worker is shown at its task from here on, not only from the first time that it renews the lease:
+-- many a task is done by then.
+local function show_at_work(priority, id, attempt, task)
+  local told = cjson.decode(info)
+  told.task = { priority = priority, entry = id, attempt = attempt, job = task.job,
+    frame = tonumber(task.frame), kind = task.kind, part = tonumber(task.part) }
+  introduce(worker, cjson.encode(told))
+end
+
 local function given(priority, id, attempt, task)
   redis.call('HSETNX', job_of(task.job), 'started', now())
+  show_at_work(priority, id, attempt, task)
   return { priority, id, attempt, task.job, task.frame, task.kind, task.part }
 end
 

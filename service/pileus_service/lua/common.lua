@@ -33,9 +33,13 @@ local function paired(flat)
   return map
 end
 
+local function introduce(worker, info)
+  redis.call('SET', 'pileus:worker:' .. worker, info, 'PX', 86400000)
+end
+
 local function greet(worker, info)
   redis.call('ZADD', 'pileus:alive', now(), worker)
-  redis.call('SET', 'pileus:worker:' .. worker, info, 'PX', 86400000)
+  introduce(worker, info)
   redis.call('HSET', 'pileus:versions', worker, cjson.decode(info).version)
 end
 
