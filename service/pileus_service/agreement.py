@@ -1,6 +1,7 @@
 """Keeps Redis true to the disk: what is wanted of each job is told to Redis, and how it ended there
 is noted on disk. The disk is the truth; what Redis lacks is built anew from it."""
 
+import math
 import threading
 import time
 from collections import Counter
@@ -16,6 +17,9 @@ from pileus_service.webhooks import Webhooks
 log = structlog.stdlib.get_logger(__name__)
 
 COMPARE_ALL = 30.0
+# So often what killed writers left is swept, when it has lain for as long: another service of this
+# folder, or a worker, may just be writing.
+SWEEP = 3600.0
 # Thousands of jobs are compared by and by, so that a request never waits for more than a page.
 PAGE = 200
 BREATH = 0.005
@@ -33,6 +37,7 @@ class Agreement:
         self._wished: dict[str, Standing] = {}
         self._seen: Mark | None = None
         self._compared = 0.0
+        self._swept = -math.inf
 
     def reconcile(self) -> None:
         """Called each second: looks at the jobs that have changed since; at all of them at first,
@@ -50,6 +55,9 @@ class Agreement:
                 elif standing is not None:
                     self._agree(job_id, standing)
         self._seen = mark
+        if now - self._swept >= SWEEP:
+            self._swept = now
+            self._sweep()
 
     def keep(self, job_id: str, wish: Wish) -> None:
         """Writes what is wanted of a job, or how it ended, to the disk."""
@@ -96,6 +104,12 @@ class Agreement:
             astray, key=lambda each: (self._wish(each[0]).state in TERMINAL, each[0])
         ):
             self._agree(job_id, standing)
+
+    def _sweep(self) -> None:
+        before = time.time() - SWEEP
+        self._store.sweep(before)
+        for name in _slowly(self._store.folders()):
+            self._store.sweep_job(name, before)
 
     def _all_in_redis(self) -> Iterator[str]:
         offset = 0

@@ -7,6 +7,7 @@ parts/BUCKET.SAMPLES.exr,logs/WORKER.jsonl}.
 """
 
 import contextlib
+import math
 import os
 import secrets
 import shutil
@@ -50,6 +51,19 @@ def sync_folder(folder: Path) -> None:
         os.fsync(opened)
     finally:
         os.close(opened)
+
+
+def sweep(folder: Path, before: float = math.inf) -> None:
+    """Removes what killed writers left in a folder, unless it was touched after a time: then its
+    writer may be at work. What cannot be removed stays, as what NFS keeps of an open file."""
+    for left in folder.glob(".*"):
+        with contextlib.suppress(OSError):
+            if left.lstat().st_mtime >= before:
+                continue
+            if left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink()
 
 
 class FrameStore:
@@ -110,8 +124,7 @@ class FrameStore:
     def sweep(self) -> None:
         """Removes the partials, and what was being written here when its writer was killed."""
         self.drop_parts()
-        for temporary in self.folder.glob(".*"):
-            temporary.unlink(missing_ok=True)
+        sweep(self.folder)
 
 
 class Store:
@@ -137,11 +150,13 @@ class Store:
 
     def job_ids(self, known: Container[str] = ()) -> Iterator[str]:
         """The jobs that are here; a folder of a known one is believed to hold it."""
+        return (name for name in self.folders() if name in known or self.has(name))
+
+    def folders(self) -> Iterator[str]:
+        """The names of the jobs' folders, those included that hold no whole job."""
         with os.scandir(self.jobs_folder) as folders:
             for folder in folders:
-                if folder.name in known or (
-                    JOB_ID.fullmatch(folder.name) and self.has(folder.name)
-                ):
+                if JOB_ID.fullmatch(folder.name):
                     yield folder.name
 
     def wish(self, job_id: str, wish: Wish) -> None:
@@ -161,9 +176,25 @@ class Store:
     def remove(self, job_id: str) -> None:
         """Forgets a job; its images, which lie outside, stay."""
         folder = self._folder(job_id)
+        # At once, as one of the same id may be made while this one goes.
+        gone = folder.with_name(f".{job_id}.{secrets.token_hex(4)}")
         with contextlib.suppress(FileNotFoundError):
-            (folder / "job.json").unlink()
-        shutil.rmtree(folder, ignore_errors=True)
+            folder.rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def sweep(self, before: float) -> None:
+        """Removes what killed writers left here, beside the jobs."""
+        for name in ("jobs", "outbox", "tokens"):
+            sweep(self.root / name, before)
+
+    def sweep_job(self, job_id: str, before: float) -> None:
+        """Removes what killed writers left of a job; all of it where its making was cut short."""
+        folder = self._folder(job_id)
+        with contextlib.suppress(OSError):
+            if self.has(job_id) or folder.stat().st_mtime >= before:
+                sweep(folder, before)
+            else:
+                shutil.rmtree(folder)
 
     def _folder(self, job_id: str) -> Path:
         if not JOB_ID.fullmatch(job_id):

@@ -1,6 +1,7 @@
 """A farm whose parts are processes of their own, so that each can be killed, stopped or drained."""
 
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -148,6 +149,10 @@ class Farm:
         left = [f"{stream}: {depth}" for stream, depth in self.queue.depths().items() if any(depth)]
         for pattern in ("*:frame:*", "*:tries:*", "*:held", "*:ready", "*:active", "*:flight"):
             left += self.queue.redis.scan_iter(f"pileus:*{pattern}")
+        # What the service or a worker was just writing for a job as a whole goes an hour later.
+        self.store.sweep(math.inf)
+        for job in self.store.folders():
+            self.store.sweep_job(job, math.inf)
         for pattern in ("jobs/*/frames/*/parts", "**/.*", "**/*.tmp"):
             left += map(str, self.data.glob(pattern))
         return left
