@@ -119,6 +119,7 @@ class Farm:
             common = ["--data", str(self.data), "--redis", self.redis.url, *self._roots]
             service = [PILEUS, "service", *common, "--listen", self.listen]
             worker = [sys.executable, "-m", "pileus_worker", *common, "--threads=1", *self._options]
+            self.worker_command = worker
             self.service = Part(service, self.folder / "service.log")
             log = self.folder / "workers.log"
             self.workers = [Part(worker, log, self._env) for _ in range(self._count)]

@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from chaos.farm import Farm, frozen, until
+from chaos.farm import Farm, Part, frozen, until
 from chaos.run import chaos
 from pileus_service.jobs import TERMINAL, JobView
 from pileus_service.shot import Shot
@@ -100,6 +100,40 @@ def test_a_child_that_dies_at_rest_keeps_its_worker_from_nothing(
         os.kill(child, signal.SIGKILL)
         until(lambda: len(worker.children) == len(before) and child not in worker.children)
         assert [seen.aside for seen in farm.queue.workers()] == [None]
+
+
+def test_a_worker_whose_renderer_does_not_start_is_set_aside_until_it_does(
+    cached_shot: Shot, tmp_path: Path
+) -> None:
+    host = tmp_path / "host"
+    host.mkdir()
+    (host / "pileus_core.py").write_text("raise ImportError('libopenvdb.so: no such file')")
+    with Farm(tmp_path, [tmp_path], 1) as farm:
+        farm.until_workers(1)
+        [well] = [worker.name for worker in farm.client.workers()]
+        sick = Part(farm.worker_command, tmp_path / "sick.log", {"PYTHONPATH": str(host)})
+
+        def trouble() -> str | None:
+            return next(each.aside for each in farm.client.workers() if each.pid == sick.pid)
+
+        def workers_of(job: str) -> set[str]:
+            assert ended(farm, job).state == "done"
+            return {line.worker for frame in (1, 2, 3) for line in farm.client.log(job, frame)}
+
+        try:
+            farm.until_workers(2)
+            until(lambda: trouble() is not None)
+            assert "libopenvdb.so: no such file" in (trouble() or "")
+            assert workers_of(farm.client.submit(cached_shot).job.id) == {well}
+            assert farm.queue.stats().get("attempts_failed", 0) == 0
+            shutil.rmtree(host)
+            until(lambda: trouble() is None)
+            farm.client.drain(well)
+            again = workers_of(farm.client.submit(longer(cached_shot, 17, "1-3")).job.id)
+            assert again and well not in again
+            assert sick.process.poll() is None
+        finally:
+            sick.end()
 
 
 @pytest.mark.slow

@@ -260,10 +260,12 @@ class Supervisor:
             return ready, ""
         except (ChildLostError, OSError) as error:
             self._drop_child()
-            log.warning("no render process", reason=str(error), output=self._output.take())
+            output = self._output.take()
+            log.warning("no render process", reason=str(error), output=output)
             if self._false_starts < FALSE_STARTS:
                 return False, ""
-            return False, f"its render process does not start: {error}"
+            told = ": ".join([str(error), *output.splitlines()[-1:]])
+            return False, f"its render process does not start: {told}"
 
     def _attempt(self, task: Task, leased: float, ending: Ending) -> None:
         """Does a task whose lease began at `leased`, and says how that went."""
