@@ -12,6 +12,7 @@ from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
 from pileus_service.store import Store
 from pileus_worker.private_redis import PrivateRedis
+from queueing import LEASE
 
 
 @pytest.fixture(scope="session")
@@ -31,6 +32,11 @@ def redis(private_redis: PrivateRedis) -> Iterator[Redis]:
     with connect(private_redis.url) as client:
         client.flushall()
         yield client
+
+
+@pytest.fixture
+def queue(redis: Redis) -> Queue:
+    return Queue(redis, lease=LEASE)
 
 
 @pytest.fixture

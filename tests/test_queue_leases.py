@@ -1,0 +1,204 @@
+"""Leases and attempts, against a real Redis: who has a task, and how often it is tried."""
+
+import time
+from collections.abc import Callable
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from redis import Redis
+
+from pileus_service.jobs import Kind, Merged, Stale, Task, WorkerInfo
+from pileus_service.queue import Queue
+from queueing import LEASE, A, B, C, D, do, lapse, submit, take, view, worker
+
+
+def test_an_expired_lease_goes_to_another_and_the_thawed_worker_cannot_take_it_back(
+    queue: Queue,
+) -> None:
+    submit(queue)
+    frozen = take(queue, A)
+    assert queue.claim(B) is None
+    lapse(queue)
+    again = take(queue, B)
+    assert (again.entry, again.attempt) == (frozen.entry, 2)
+    assert queue.renew(frozen, A) == "lost"
+    assert not do(queue, frozen, A)
+    assert queue.fail(frozen, "A", "late") == "lost"
+    assert queue.renew(again, B) == "held"
+    assert do(queue, again, B)
+
+
+def test_an_absence_of_redis_costs_nobody_an_attempt(redis: Redis) -> None:
+    queue = Queue(redis, lease=0.4)
+    submit(queue)
+    task = take(queue)
+    for _ in range(4):
+        time.sleep(0.5)  # nobody reaches Redis for more than a lease
+        assert queue.claim(B) is None, "A has not had its time to renew"
+        queue.hand_back(task, "A")  # as a worker does that had to drop it
+        task = take(queue)
+        assert task.attempt == 1
+    end = time.monotonic() + 10
+    while (again := queue.claim(B)) is None:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert again.attempt == 2, "B was there, and A was not"
+
+
+def test_renewal_keeps_the_lease_and_the_attempt_count(queue: Queue) -> None:
+    submit(queue)
+    task = take(queue, A)
+    for _ in range(3):
+        time.sleep(LEASE / 2)
+        assert queue.renew(task, A) == "held"
+        assert queue.claim(B) is None
+    lapse(queue)
+    assert take(queue, B).attempt == 2
+
+
+def test_unwanted_work_is_known_at_renewal(queue: Queue) -> None:
+    submit(queue)
+    task = take(queue)
+    queue.control("job", "cancel")
+    assert queue.renew(task, A) == "unwanted"
+
+
+def test_three_failed_attempts_on_distinct_workers_park_the_task_and_fail_its_frame(
+    queue: Queue,
+) -> None:
+    submit(queue, frames=1)
+    for info in (A, B, C, D):
+        queue.claim(info)  # makes itself known; A gets the task
+    task = Task(
+        priority=5, entry=_entry(queue), attempt=1, job="job", frame=0, kind=Kind.PLAN, part=0
+    )
+    assert queue.fail(task, "A", "no grid") == "released"
+    assert queue.claim(A) is None, "the same worker tries again only where no other lives"
+    assert take(queue, B).attempt == 2
+    assert queue.fail(task, "B", "no grid") == "released"
+    assert queue.claim(B) is None
+    assert take(queue, C).attempt == 3
+    assert queue.fail(task, "C", "no memory") == "parked"
+    assert queue.claim(D) is None
+    assert view(queue) == ("failed", 0, 1)
+    assert queue.failed("job") == {0: "plan failed: A: no grid; B: no grid; C: no memory"}
+
+
+def _entry(queue: Queue) -> str:
+    [pending] = queue.redis.xpending_range("pileus:tasks:5", "workers", "-", "+", 2)
+    return str(pending["message_id"])
+
+
+def test_a_lone_worker_makes_all_three_attempts(queue: Queue) -> None:
+    submit(queue, frames=2)
+    for outcome in ("released", "released", "parked"):
+        task = take(queue)
+        assert task.frame == 0
+        assert queue.fail(task, "A", "crashed") == outcome
+    assert take(queue).frame == 1, "the next frame goes on"
+
+
+def test_a_worker_lost_three_times_over_parks_the_task_too(queue: Queue) -> None:
+    submit(queue)
+    for info in (A, B, C):
+        take(queue, info)
+        lapse(queue)
+    assert queue.claim(D) is None
+    reason = queue.failed("job")[0]
+    assert reason == "plan failed: A: stopped answering; B: stopped answering; C: stopped answering"
+
+
+def test_a_task_handed_back_counts_no_attempt(queue: Queue) -> None:
+    submit(queue)
+    for _ in range(5):
+        task = take(queue)
+        assert task.attempt == 1
+        queue.hand_back(task, "A")
+
+
+def test_completion_counts_once_however_often_a_task_was_done(queue: Queue) -> None:
+    submit(queue)
+    do(queue, take(queue), tasks=2)
+    first = take(queue, A)
+    lapse(queue)
+    second = take(queue, B)
+    assert do(queue, second, B)
+    assert not do(queue, first, A)
+    assert not do(queue, second, B)
+    seen = queue.job("job")
+    assert seen is not None
+    assert (seen.samples, seen.tasks) == (10, 2)
+
+
+def test_a_damaged_partial_is_rendered_again_a_bounded_number_of_times(queue: Queue) -> None:
+    submit(queue)
+    do(queue, take(queue), tasks=3)
+    for _ in range(3):
+        do(queue, take(queue))
+    for _ in range(4):
+        merge = take(queue)
+        assert merge.kind is Kind.MERGE
+        queue.complete(merge, "A", Merged(redo=[1], reason="part 1 is damaged"))
+        task = queue.claim(A)
+        if task:
+            assert (task.kind, task.part) == (Kind.RENDER, 1)
+            do(queue, task)
+    assert queue.failed("job") == {0: "merge failed: part 1 is damaged"}
+
+
+def test_a_stale_plan_is_made_anew_a_bounded_number_of_times(queue: Queue) -> None:
+    submit(queue)
+    for _ in range(4):
+        do(queue, take(queue), tasks=2)
+        assert queue.complete(take(queue), "A", Stale(stale="cloud.vdb changes"))
+    assert queue.failed("job") == {0: "render failed: cloud.vdb changes"}
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 9)), max_size=60))
+def test_whatever_happens_every_frame_ends_and_nothing_is_left(
+    redis: Redis, steps: list[tuple[str, int]]
+) -> None:
+    """Workers claim, finish, hand back, freeze and are taken for dead in any order."""
+    redis.flushall()
+    queue = Queue(redis, lease=0.1)
+    submit(queue, "one", frames=3)
+    submit(queue, "two", frames=2, priority=7)
+    held: dict[str, list[Task]] = {"A": [], "B": [], "C": []}
+    actions: dict[int, Callable[[Task, WorkerInfo], object]] = {
+        0: lambda task, info: queue.hand_back(task, info.name),
+        1: lambda task, info: queue.fail(task, info.name, "crash"),
+        2: lambda task, info: time.sleep(0.15),
+    }
+
+    def finish(task: Task, info: WorkerInfo) -> object:
+        return do(queue, task, info)
+
+    for name, action in steps:
+        info = worker(name)
+        if action == 9:
+            queue.control("one", "pause")
+            queue.control("one", "resume")
+        elif action == 8:
+            queue.control("one", "priority", len(held[name]) % 10)
+        elif held[name] and action < 7:
+            act = actions.get(action, finish)
+            act(held[name].pop(), info)
+        elif task := queue.claim(info):
+            held[name].append(task)
+    deadline = time.monotonic() + 30
+    while any(view(queue, job)[0] not in ("done", "failed") for job in ("one", "two")):
+        assert time.monotonic() < deadline, "the farm came to a stand"
+        if task := queue.claim(D):
+            do(queue, task, D)
+        else:
+            time.sleep(0.005)
+    time.sleep(0.15)
+    assert queue.claim(D) is None
+    assert all(depth == (0, 0) for depth in queue.depths().values())
+    for job in ("one", "two"):
+        seen = queue.job(job)
+        assert seen is not None
+        assert seen.frames_done + seen.frames_failed == seen.frames
