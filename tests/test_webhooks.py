@@ -150,7 +150,7 @@ def test_notices_are_bounded_in_number_at_once_and_in_time(
         old = Notice.model_validate_json(kept[0].read_bytes())
         aged = old.model_copy(update={"created": time.time() - webhooks.LIFETIME})
         kept[0].write_text(aged.model_copy(update={"url": "http://127.0.0.1:9/"}).model_dump_json())
-        with service(redis, tmp_path, urls=f"{ear.url}/hook"):
+        with service(redis, tmp_path, urls=f"{ear.url}/hook", allow="http://127.0.0.1:9"):
             until(ear.heard, 29)
             end = time.monotonic() + 60
             while any((tmp_path / "data" / "outbox").iterdir()):
@@ -185,6 +185,48 @@ def test_users_cannot_make_the_service_call_where_its_keeper_has_not_allowed(
     assert answer.status_code == 422
     assert "webhook" in answer.json()["detail"]
     assert send(client, shot, webhook="https://HOOKS.studio.example:443/a?b=c")
+
+
+@pytest.mark.usefixtures("caches")
+@pytest.mark.parametrize("when", ["before it ends", "after it has ended"])
+def test_an_address_that_is_allowed_no_more_is_called_no_more(
+    redis: Redis, tmp_path: Path, shot: dict[str, Any], when: str
+) -> None:
+    with listening() as ear, listening() as other:
+        asleep = service(redis, tmp_path, allow=ear.url)
+        job = send(asleep, shot, webhook=f"{ear.url}/mine")
+        if when == "after it has ended":
+            asleep.post(f"/v1/jobs/{job}/cancel")
+        with service(redis, tmp_path, urls=f"{other.url}/all") as client:
+            if when == "before it ends":
+                client.post(f"/v1/jobs/{job}/cancel")
+            else:
+                client.post(f"/v1/jobs/{send(client, shot)}/cancel")
+            until(other.heard, 1)
+            end = time.monotonic() + 60
+            while any((tmp_path / "data" / "outbox").iterdir()):
+                assert time.monotonic() < end
+                time.sleep(0.05)
+        assert not ear.heard
+
+
+@pytest.mark.usefixtures("caches")
+def test_a_spoilt_notice_holds_up_no_other(
+    redis: Redis, tmp_path: Path, shot: dict[str, Any]
+) -> None:
+    outbox = tmp_path / "data" / "outbox"
+    outbox.mkdir(parents=True)
+    (outbox / "msg_cut.json").write_text('{"id": "msg_')
+    wrong = Notice(id="msg_odd", url="gopher://[", created=time.time(), body="{}")
+    (outbox / "msg_odd.json").write_text(wrong.model_dump_json())
+    with listening() as ear, service(redis, tmp_path, urls=f"{ear.url}/hook") as client:
+        time.sleep(1)
+        client.post(f"/v1/jobs/{send(client, shot)}/cancel")
+        until(ear.heard, 1)
+        end = time.monotonic() + 60
+        while any(outbox.glob("*.json")):
+            assert time.monotonic() < end
+            time.sleep(0.05)
 
 
 def test_webhooks_without_a_good_secret_are_refused_at_the_start(

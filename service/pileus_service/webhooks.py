@@ -84,9 +84,17 @@ class Webhooks:
                 "with PILEUS_WEBHOOK_ALLOW"
             )
 
+    def _may_call(self, url: str) -> bool:
+        """Whether the keeper still wants a notice to go there: what was allowed may be no more."""
+        try:
+            return url in self._urls or _origin(url, "webhook") in self._allowed
+        except InputError:
+            return False
+
     def note_end(self, job: Job, wish: Wish) -> None:
         """Keeps a notice of a job's end for each that wants it."""
-        urls = dict.fromkeys([*self._urls, *([job.webhook] if job.webhook else [])])
+        theirs = [job.webhook] if job.webhook and self._may_call(job.webhook) else []
+        urls = dict.fromkeys([*self._urls, *theirs])
         if not urls:
             return
         if sum(1 for _ in self._files()) >= MOST_KEPT:
@@ -136,10 +144,16 @@ class Webhooks:
     ) -> None:
         try:
             notice = Notice.model_validate_json(path.read_bytes())
-            await self._insist(http, gate, notice)
-            path.unlink()
-        except (OSError, ValidationError) as error:
-            log.warning("a notice is spoilt", file=path.name, reason=str(error))
+            if self._may_call(notice.url):
+                await self._insist(http, gate, notice)
+            else:
+                log.error("webhook given up", notice=notice.id, reason="it may not be called")
+            path.unlink(missing_ok=True)
+        except ValidationError:
+            log.error("a notice is spoilt and is dropped", file=path.name)
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("a notice waits for the disk", file=path.name, reason=str(error))
         finally:
             self._in_hand.discard(path)
 
