@@ -1,8 +1,10 @@
 """A job's life in the queue, against a real Redis: steered, retried, and told as it is."""
 
+import time
+
 from redis import Redis
 
-from pileus_service.jobs import JobView, Kind
+from pileus_service.jobs import JobView, Kind, Wish
 from pileus_service.queue import Queue
 from queueing import A, B, do, submit, take, view
 
@@ -112,6 +114,19 @@ def test_a_job_tells_the_first_of_its_failed_frames(queue: Queue) -> None:
     seen = queue.job("job")
     assert seen and (seen.frames_done, seen.frames_failed) == (10, 2)
     assert seen.reason == "9: plan failed: A: no cache 9"
+    queue.redis.flushall()
+    failed = {10: "plan failed: B", 4: "plan failed: A"}
+    queue.submit("job", "job", time.time(), 12, Wish(state="failed", failed=failed), range(4))
+    seen = queue.job("job")
+    assert seen and seen.reason == "4: plan failed: A"
+    queue.control("job", "retry", 1)
+    seen = queue.job("job")
+    assert seen and (seen.frames_failed, seen.reason) == (0, None)
+    while not queue.failed("job"):
+        queue.fail(take(queue), "A", "anew")
+    assert queue.failed("job", [3, 4, 5]) == {4: "plan failed: A: anew"}
+    seen = queue.job("job")
+    assert seen and seen.reason == "4: plan failed: A: anew"
 
 
 def test_many_jobs_are_told_as_each_alone_is(queue: Queue) -> None:

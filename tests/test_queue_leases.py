@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis import Redis
@@ -202,3 +203,20 @@ def test_whatever_happens_every_frame_ends_and_nothing_is_left(
         seen = queue.job(job)
         assert seen is not None
         assert seen.frames_done + seen.frames_failed == seen.frames
+
+
+@pytest.mark.parametrize("how", ["done", "failed", "handed back", "renewed"])
+def test_a_task_that_was_taken_out_of_its_stream_is_nobodys(queue: Queue, how: str) -> None:
+    """By a keeper who tidies up: its worker must not insist for ever on what cannot be."""
+    submit(queue, frames=2)
+    task = take(queue)
+    queue.redis.xdel("pileus:tasks:5", task.entry)
+    if how == "done":
+        assert not do(queue, task)
+    elif how == "failed":
+        assert queue.fail(task, "A", "bad") == "lost"
+    elif how == "renewed":
+        assert queue.renew(task, A) == "lost"
+    else:
+        queue.hand_back(task, "A")
+    assert take(queue).frame == 1

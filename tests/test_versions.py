@@ -94,6 +94,20 @@ def test_a_failed_attempt_is_not_left_waiting_for_workers_of_another_version(red
     assert seen and seen.state == "failed"
 
 
+def test_a_failed_attempt_is_not_left_waiting_for_workers_that_cannot_read_it(
+    redis: Redis,
+) -> None:
+    old, new = Queue(redis, LEASE), Queue(redis, LEASE, FORMAT + 1)
+    new.submit("newer", "newer", time.time(), 1, Wish())
+    for attempt in (1, 2, 3):
+        assert old.claim(OLD) is None
+        task = new.claim(NEW)
+        assert task and task.attempt == attempt
+        new.fail(task, NEW.name, "no good")
+    seen = new.job("newer")
+    assert seen and seen.state == "failed"
+
+
 def test_a_frame_whose_version_is_gone_is_planned_anew(redis: Redis) -> None:
     queue = planned_by_old(redis, plan("1"))
     task = queue.claim(OLD)

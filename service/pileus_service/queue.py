@@ -196,10 +196,19 @@ class Queue:
     def state(self, job: str) -> str | None:
         return cast(str | None, self.redis.hget(f"pileus:job:{job}", "state"))
 
-    def failed(self, job: str) -> dict[int, str]:
-        """Reason by frame index."""
-        held = cast(dict[str, str], self.redis.hgetall(f"pileus:job:{job}:failed"))
-        return {int(frame): reason for frame, reason in held.items()}
+    def failed(self, job: str, frames: Sequence[int] | None = None) -> dict[int, str]:
+        """Reason by frame index, of some frames or of all."""
+        key = f"pileus:job:{job}:failed"
+        if frames is None:
+            held = cast(dict[str, str], self.redis.hgetall(key))
+            return {int(frame): reason for frame, reason in held.items()}
+        ask = list(map(str, frames))
+        told = cast(list[str | None], self.redis.hmget(key, ask)) if ask else []
+        return {frame: why for frame, why in zip(frames, told, strict=True) if why is not None}
+
+    def failed_frames(self, job: str) -> set[int]:
+        """The indices of the frames that have failed."""
+        return set(map(int, self.redis.hkeys(f"pileus:job:{job}:failed")))
 
     def done(self, job: str) -> set[int]:
         """The indices of the frames that are done."""
@@ -347,6 +356,7 @@ class Queue:
         self.redis.zrem("pileus:alive", worker)
         self.redis.delete(f"pileus:worker:{worker}")
         self.redis.hdel("pileus:versions", worker)
+        self.redis.hdel("pileus:formats", worker)
         self.redis.hdel("pileus:strikes", worker)
         self.undrain(worker)
         for priority in PRIORITIES:

@@ -13,11 +13,10 @@ FRAME_STATES: dict[str, Literal["planning", "rendering", "merging"]] = {
 
 
 class Row(TypedDict, total=False):
-    """A job as views.lua tells it; `first_failed` and `reason` are there if any frame failed."""
+    """A job as views.lua tells it; `reason` is that of the first frame that failed, if any did."""
 
     held: dict[str, str]
     failed: int
-    first_failed: int
     reason: str
     flight: dict[str, str]
     active: list[tuple[str, dict[str, str]]]
@@ -56,7 +55,7 @@ def job_view(job: str, row: Row, now: float) -> JobView:
         finished=int(held["finished"]) / 1000 if "finished" in held else None,
         seconds_left=left,
         # By index as all else here; `Farm` puts in the frame's number.
-        reason=f"{row['first_failed']}: {row['reason']}" if failed else None,
+        reason=f"{held['first_failed']}: {row['reason']}" if "reason" in row else None,
         active=active,
     )
 

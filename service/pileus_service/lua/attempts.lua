@@ -31,6 +31,11 @@ local function suits(task, worker)
   return true
 end
 
+-- Whether a worker knows what a task says; until formats were told there was but the first.
+local function reads(worker, task)
+  return tonumber(task.format) <= tonumber(redis.call('HGET', 'pileus:formats', worker) or 1)
+end
+
 -- What an attempt's failure leads to for the worker that asks: 'take', 'skip' or 'park'.
 -- The delivery count is the attempt count. The attempts go to distinct workers while such live.
 local function verdict(stream, id, task, deliveries, worker)
@@ -38,7 +43,8 @@ local function verdict(stream, id, task, deliveries, worker)
   if redis.call('HLEN', tries) >= ATTEMPTS then return 'park' end
   if redis.call('HEXISTS', tries, worker) == 0 then return 'take' end
   for _, other in ipairs(live_workers()) do
-    if redis.call('HEXISTS', tries, other) == 0 and not aside(other) and suits(task, other) then
+    if redis.call('HEXISTS', tries, other) == 0 and not aside(other) and reads(other, task)
+        and suits(task, other) then
       return 'skip'
     end
   end

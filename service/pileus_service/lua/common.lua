@@ -41,6 +41,7 @@ local function greet(worker, info)
   redis.call('ZADD', 'pileus:alive', now(), worker)
   introduce(worker, info)
   redis.call('HSET', 'pileus:versions', worker, cjson.decode(info).version)
+  redis.call('HSET', 'pileus:formats', worker, FORMAT)
 end
 
 -- What the service compares with its disk, of all jobs in one place; a count of the changes, and at
@@ -76,11 +77,15 @@ local function wanted(task)
   return tonumber(task.part) < tonumber(tasks) and redis.call('GETBIT', at .. ':bits', task.part) == 0
 end
 
--- The pending record of an entry if the worker owns it, else nil.
+-- The pending record of an entry and its task if the worker owns it, else nil; one that a keeper has
+-- deleted is nobody's.
 local function owned(stream, id, worker)
   if redis.call('EXISTS', stream) == 0 then return nil end
   local pending = redis.call('XPENDING', stream, GROUP, id, id, 1)[1]
-  return pending and pending[2] == worker and pending or nil
+  if not pending or pending[2] ~= worker then return nil end
+  local task = read(stream, id)
+  if task then return pending, task end
+  redis.call('XACK', stream, GROUP, id)
 end
 
 -- What an in-flight task has rendered, for the job's progress.

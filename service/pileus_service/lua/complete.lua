@@ -3,8 +3,9 @@
 local REDOS = 3
 local LOOK_AGAIN = 5000 -- milliseconds until a missing cache is looked for again, at least
 local worker, stream, id = ARGV[2], stream_of(ARGV[3]), ARGV[4]
-if not owned(stream, id, worker) then return 0 end
-local task, result = read(stream, id), cjson.decode(ARGV[5])
+local pending, task = owned(stream, id, worker)
+if not pending then return 0 end
+local result = cjson.decode(ARGV[5])
 local job, frame = task.job, task.frame
 local key, at = job_of(job), frame_of(job, frame)
 local still_wanted = wanted(task)

@@ -47,6 +47,7 @@ elseif verb == 'retry' and (open or state == 'failed') then
   local first = tonumber(redis.call('HGET', key, 'next'))
   for _, frame in ipairs(failed) do first = math.min(first, tonumber(frame)) end
   redis.call('HSET', key, 'next', first)
+  redis.call('HDEL', key, 'first_failed')
   if state == 'failed' then
     local started, finished = unpack(redis.call('HMGET', key, 'started', 'finished'))
     if started and finished then redis.call('HINCRBY', key, 'idle', now() - finished) end

@@ -123,8 +123,16 @@ local function advance(job)
   end
 end
 
+-- Which failed first is kept: a look at a job is not to go through all of a hundred thousand.
+local function note_failed(job, frame, reason)
+  local key = job_of(job)
+  redis.call('HSET', key .. ':failed', frame, reason)
+  local first = tonumber(redis.call('HGET', key, 'first_failed') or frame)
+  redis.call('HSET', key, 'first_failed', math.min(first, tonumber(frame)))
+end
+
 local function fail_frame(job, frame, reason)
-  redis.call('HSET', job_of(job) .. ':failed', frame, reason)
+  note_failed(job, frame, reason)
   forget_frame(job, frame)
   count('frames_failed')
   advance(job)

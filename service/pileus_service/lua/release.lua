@@ -2,9 +2,9 @@
 -- With a reason ARGV[5] its attempt failed; without one it is handed back and the attempt is
 -- not counted. Returns 'released', 'parked', or 'lost' if it was not the worker's any more.
 local worker, stream, id, reason = ARGV[2], stream_of(ARGV[3]), ARGV[4], ARGV[5]
-local pending = owned(stream, id, worker)
+local pending, task = owned(stream, id, worker)
 if not pending then return 'lost' end
-local attempts, task = pending[4], read(stream, id)
+local attempts = pending[4]
 land(task.job, worker)
 if not wanted(task) then
   retire(stream, id)

@@ -3,8 +3,8 @@
 -- that the delivery count stays the attempt count. Returns 'held', 'unwanted', or 'lost'.
 local worker, stream, id, info = ARGV[2], stream_of(ARGV[3]), ARGV[4], ARGV[5]
 greet(worker, info)
-if not owned(stream, id, worker) then return 'lost' end
-local task = read(stream, id)
+local pending, task = owned(stream, id, worker)
+if not pending then return 'lost' end
 if not wanted(task) then return 'unwanted' end
 redis.call('XCLAIM', stream, GROUP, worker, 0, id, 'JUSTID')
 note_flight(task.job, worker, task.frame, ARGV[6])

@@ -9,7 +9,7 @@ redis.call('HSET', key, 'name', given.name, 'state', given.state, 'priority', gi
 note_standing(job)
 if type(given.finished) == 'number' then redis.call('HSET', key, 'finished', given.finished) end
 for _, frame in ipairs(given.done) do redis.call('SETBIT', key .. ':done', frame, 1) end
-for frame, reason in pairs(given.failed) do redis.call('HSET', key .. ':failed', frame, reason) end
+for frame, reason in pairs(given.failed) do note_failed(job, frame, reason) end
 redis.call('ZADD', 'pileus:jobs', given.created, job)
 if given.state == 'running' then advance(job) end
 return 1

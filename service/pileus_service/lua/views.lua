@@ -6,21 +6,14 @@ local jobs = {}
 for number = 2, #ARGV do
   local key = job_of(ARGV[number])
   local held = paired(redis.call('HGETALL', key))
-  local failed, first = redis.call('HLEN', key .. ':failed'), nil
-  if failed > 0 then
-    for _, frame in ipairs(redis.call('HKEYS', key .. ':failed')) do
-      first = math.min(first or frame, tonumber(frame))
-    end
-  end
   local active = {}
   for _, frame in ipairs(redis.call('ZRANGE', key .. ':active', 0, -1)) do
     active[#active + 1] = { frame, paired(redis.call('HGETALL', frame_of(ARGV[number], frame))) }
   end
   jobs[number - 1] = held.state and {
     held = held,
-    failed = failed,
-    first_failed = first,
-    reason = first and redis.call('HGET', key .. ':failed', first),
+    failed = redis.call('HLEN', key .. ':failed'),
+    reason = held.first_failed and redis.call('HGET', key .. ':failed', held.first_failed) or nil,
     flight = paired(redis.call('HGETALL', key .. ':flight')),
     active = active,
   } or false
