@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from fastapi import FastAPI
@@ -16,7 +16,7 @@ from redis import Redis
 from pileus_service.app import create_app
 from pileus_service.auth import Guard
 from pileus_service.farm import Farm
-from pileus_service.jobs import Merged, Planned, WorkerInfo
+from pileus_service.jobs import Job, Merged, Planned, Wish, WorkerInfo
 from pileus_service.queue import Queue
 
 LOCAL = "http://127.0.0.1"
@@ -77,6 +77,20 @@ def test_an_idempotency_key_makes_one_job_of_many_submissions(
     assert (first.status_code, second.status_code) == (201, 200)
     assert first.json()["job"]["id"] == second.json()["job"]["id"]
     assert "Idempotency-Key" in problem(post({**shot, "name": "other"}), 409)
+
+
+def test_a_job_that_is_removed_as_it_comes_is_a_conflict(
+    client: TestClient, farm: Farm, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create = farm.store.create
+
+    def create_and_remove(job: Job, wish: Wish) -> bool:
+        new = create(job, wish)
+        assert farm.remove(job.id)
+        return new
+
+    monkeypatch.setattr(farm.store, "create", create_and_remove)
+    assert "submit it anew" in problem(client.post("/v1/jobs", json={"shot": shot}), 409)
 
 
 def test_wrong_input_is_a_problem_that_points_at_the_field(
@@ -175,6 +189,41 @@ def test_a_change_that_redis_forgot_is_made_again(
     client.post(f"/v1/jobs/{job}/pause")
     farm.queue.control(job, "resume")  # as after a restart that lost the last second
     wait_for(lambda: farm.queue.state(job) == "paused")
+
+
+def test_a_redis_that_knows_another_job_of_the_same_key_is_put_right(
+    client: TestClient, farm: Farm, shot: dict[str, Any], redis: Redis
+) -> None:
+    """Its frames are those of the shot that was removed: a worker would look for one in vain."""
+
+    def post(frames: str) -> str:
+        body = {"shot": {**shot, "frames": frames}}
+        answer = client.post("/v1/jobs", json=body, headers={"Idempotency-Key": "k1"})
+        return str(answer.json()["job"]["id"])
+
+    job = post("1-3")
+    dump = cast(Callable[..., bytes], redis.execute_command)
+    earlier = [(key, dump("DUMP", key, NEVER_DECODE=True)) for key in redis.scan_iter()]
+    client.delete(f"/v1/jobs/{job}")
+    assert post("1-2") == job
+    wait_for(lambda: farm.agreement.states() == {"running": 1})
+    redis.flushall()
+    for key, value in earlier:
+        redis.restore(key, 0, value)
+    wait_for(lambda: client.get(f"/v1/jobs/{job}").json()["frames"] == 2)
+
+
+def test_garbage_in_redis_keeps_the_service_from_nothing(
+    client: TestClient, farm: Farm, shot: dict[str, Any], redis: Redis
+) -> None:
+    job = submit(client, shot)
+    wait_for(lambda: farm.agreement.states() == {"running": 1})
+    redis.hset("pileus:standing", "NO JOB", "what")
+    redis.zadd("pileus:changed", {"NO JOB": redis.incr("pileus:changes")})
+    time.sleep(1.5)
+    redis.delete("pileus:standing")
+    redis.flushall()
+    wait_for(lambda: farm.queue.job_ids(10) == [job])
 
 
 def test_of_many_listeners_each_hears_the_end_once(

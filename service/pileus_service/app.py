@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -56,12 +56,21 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
                 log.warning("cannot reconcile yet", reason=str(error))
             await asyncio.sleep(1)
 
+    async def for_ever(work: Callable[[], Awaitable[None]]) -> None:
+        """Begins work again whatever ends it: without it the service would answer, and no more."""
+        while True:
+            try:
+                await work()
+            except Exception:
+                log.exception("the service's own work failed; it begins again")
+            await asyncio.sleep(1)
+
     broadcast = Broadcast(farm)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        running = (keep_true(), broadcast.run(), farm.hooks.deliver())
-        tasks = [asyncio.create_task(each) for each in running]
+        works = (keep_true, broadcast.run, farm.hooks.deliver)
+        tasks = [asyncio.create_task(for_ever(work)) for work in works]
         yield
         for task in tasks:
             task.cancel()

@@ -34,7 +34,7 @@ log = structlog.stdlib.get_logger(__name__)
 
 
 class ConflictError(InputError):
-    """The same idempotency key was used for something else."""
+    """The same idempotency key was used for something else, or is being removed."""
 
 
 class Farm:
@@ -71,7 +71,8 @@ class Farm:
             webhook=webhook,
             wait_for_caches=wait_for_caches,
         )
-        wish = Wish(priority=priority)
+        # No life of a job that had the same key before: a Redis of that day is not to be believed.
+        wish = Wish(priority=priority, life=int(job.created * 1000))
         new = self.store.create(job, wish)
         if not new:
             held = self.store.job(job.id)
@@ -80,7 +81,8 @@ class Farm:
         if new:
             log.info("submitted", job=job.id, name=shot.name, frames=len(numbers))
         view = self.job(job.id)
-        assert view is not None
+        if view is None:
+            raise ConflictError("The job was removed as it came; submit it anew")
         return view, new
 
     def control(self, job_id: str, verb: Verb, priority: int = 0) -> JobView | None:
@@ -150,13 +152,15 @@ class Farm:
         job, view = self.store.job(job_id), self.job(job_id)
         if job is None or view is None:
             return None
-        failed, waiting = self.queue.failed(job_id), self.queue.waiting(job_id)
+        page = list(enumerate(job.shot.frame_numbers))[offset : offset + limit]
+        failed = self.queue.failed(job_id, [index for index, _ in page])
+        waiting = self.queue.waiting(job_id)
         active = {frame.frame: frame for frame in view.active}
         idle: Literal["cancelled", "waiting"] = (
             "cancelled" if view.state is JobState.CANCELLED else "waiting"
         )
         frames = []
-        for index, number in list(enumerate(job.shot.frame_numbers))[offset : offset + limit]:
+        for index, number in page:
             if number in active:
                 frames.append(active[number])
             elif index in failed:
@@ -186,7 +190,7 @@ class Farm:
         letters = ["c" if view.state is JobState.CANCELLED else "."] * view.frames
         for index in self.queue.done(job_id):
             letters[index] = "d"
-        for index in self.queue.failed(job_id):
+        for index in self.queue.failed_frames(job_id):
             letters[index] = "f"
         for index, number in enumerate(job.shot.frame_numbers):
             letters[index] = active.get(number, letters[index])

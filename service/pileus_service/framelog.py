@@ -4,6 +4,7 @@ Every worker appends to a file of its own, as appending by several hosts to one 
 NFS. A file that has grown to its bound becomes the worker's old one, and the older is dropped.
 """
 
+import contextlib
 import logging
 import os
 from pathlib import Path
@@ -67,12 +68,15 @@ def _append(path: Path, line: str) -> None:
 
 def read(folder: Path, limit: int) -> list[LogLine]:
     """The last lines of all workers in the order of their time."""
-    files = sorted(folder.glob("*.jsonl"), key=lambda path: path.stat().st_mtime)[-FILES_READ:]
+    files = []
+    for path in folder.glob("*.jsonl"):
+        with contextlib.suppress(FileNotFoundError):  # it is an old one by now, or gone
+            files.append((path.stat().st_mtime, path))
     lines = []
-    for path in files:
-        for text in path.read_bytes().splitlines():
-            try:
-                lines.append(LogLine.model_validate_json(text))
-            except ValidationError:
-                continue  # half a line, of a host that went down
+    for _, path in sorted(files)[-FILES_READ:]:
+        with contextlib.suppress(FileNotFoundError):
+            for text in path.read_bytes().splitlines():
+                # Half a line is of a host that went down.
+                with contextlib.suppress(ValidationError):
+                    lines.append(LogLine.model_validate_json(text))
     return sorted(lines, key=lambda line: line.time)[-limit:]

@@ -68,7 +68,8 @@ class Job(Record):
 class Wish(Record):
     """What is wanted of a job and how it ended: state.json, written by the service alone.
 
-    A retry begins a new life; where Redis knows an older one, it is not to be believed.
+    A job's making and each retry begin a new life; where Redis knows an older one, it is not to be
+    believed.
     """
 
     state: Literal["running", "paused", "cancelled", "failed", "done"] = "running"

@@ -16,7 +16,7 @@ import pytest
 
 from chaos.farm import Farm, Part, frozen, until
 from chaos.run import chaos
-from pileus_service.jobs import TERMINAL, JobView
+from pileus_service.jobs import TERMINAL, Job, JobView, Wish
 from pileus_service.shot import Shot
 from serial_render import same_bits
 
@@ -100,6 +100,19 @@ def test_a_child_that_dies_at_rest_keeps_its_worker_from_nothing(
         os.kill(child, signal.SIGKILL)
         until(lambda: len(worker.children) == len(before) and child not in worker.children)
         assert [seen.aside for seen in farm.queue.workers()] == [None]
+
+
+def test_a_frame_that_no_shot_has_costs_no_worker(cached_shot: Shot, tmp_path: Path) -> None:
+    """As where Redis still speaks of a job that was removed and made anew under its key."""
+    with Farm(tmp_path, [tmp_path], 1) as farm:
+        [pid] = [part.pid for part in farm.workers]
+        one = cached_shot.model_copy(update={"frames": "1"})
+        farm.store.create(Job(id="odd", created=time.time(), shot=one), Wish())
+        farm.queue.submit("odd", "odd", time.time(), 3, Wish())
+        until(lambda: farm.queue.state("odd") == "failed")
+        seen = farm.queue.job("odd")
+        assert seen and (seen.frames_done, seen.frames_failed) == (1, 2)
+        assert [part.pid for part in farm.workers] == [pid]
 
 
 def test_a_worker_whose_renderer_does_not_start_is_set_aside_until_it_does(

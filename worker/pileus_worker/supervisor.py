@@ -273,11 +273,11 @@ class Supervisor:
             job = self._store.job(task.job)
             if job is None:
                 raise FileNotFoundError(f"{self._store.root}: has no job {task.job}")
-        except OSError as error:
+            frame = job.shot.frame_numbers[task.frame]
+        except (OSError, IndexError) as error:
             log.warning("cannot begin", job=task.job, task=task.label, reason=str(error))
             self._tell(task, child.Failed(str(error), Cause.DISK), ending)
             return
-        frame = job.shot.frame_numbers[task.frame]
         with structlog.contextvars.bound_contextvars(
             job=task.job, frame=frame, task=task.label, attempt=task.attempt
         ):
