@@ -248,6 +248,21 @@ def test_of_many_listeners_each_hears_the_end_once(
     assert all("paused" in states for states in told), told
 
 
+def test_a_data_folder_that_fails_is_a_problem_and_not_for_ever(
+    client: TestClient, farm: Farm, shot: dict[str, Any]
+) -> None:
+    away = farm.store.root / "away"
+    farm.store.jobs_folder.rename(away)
+    farm.store.jobs_folder.touch()  # as where the disk that is mounted there has gone
+    answer = client.post("/v1/jobs", json={"shot": shot})
+    assert "data folder" in problem(answer, 503)
+    assert answer.headers["Retry-After"]
+    farm.store.jobs_folder.unlink()
+    away.rename(farm.store.jobs_folder)
+    job = submit(client, shot)
+    assert client.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
+
+
 def test_no_redis_is_a_problem_not_a_stack_trace(farm: Farm, shot: dict[str, Any]) -> None:
     dead = Redis.from_url("unix:///nowhere/redis", decode_responses=True)
     app: FastAPI = create_app(Farm(farm.store, Queue(dead), farm.roots), Guard())

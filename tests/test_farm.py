@@ -209,7 +209,7 @@ def test_a_lost_redis_loses_nothing_and_renders_nothing_twice(
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
-@pytest.mark.parametrize("damage", ["flipped", "truncated"])
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "foreign"])
 def test_a_damaged_partial_is_rendered_again(
     client: Client, long_shot: Shot, tmp_path: Path, damage: str
 ) -> None:
@@ -220,9 +220,17 @@ def test_a_damaged_partial_is_rendered_again(
         assert time.monotonic() < end
         time.sleep(0.01)
     client.control(job, "pause")
-    data = bytearray(files[0].read_bytes())
-    data[len(data) // 2] ^= 0x10
-    files[0].write_bytes(data if damage == "flipped" else data[: len(data) // 2])
+    victim = files[0]
+    data = bytearray(victim.read_bytes())
+    if damage == "flipped":
+        data[len(data) // 2] ^= 0x10
+        victim.write_bytes(data)
+    elif damage == "truncated":
+        victim.write_bytes(data[: len(data) // 2])
+    elif damage == "missing":
+        victim.unlink()
+    else:  # whole, but of another shot
+        core.Partial.read(str(victim)).write(str(victim), "another")
     client.control(job, "resume")
     finish(client, job)
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)

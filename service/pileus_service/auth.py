@@ -175,11 +175,12 @@ def _refuse_foreign_page(request: Request) -> None:
 
 
 def _network(address: str) -> str:
-    """Who counts as one caller: an IPv4 address, the /64 of an IPv6 one."""
+    """Who counts as one caller: an IPv4 address, in whatever clothes, the /64 of an IPv6 one."""
     try:
-        if ipaddress.ip_address(address).version == 4:
-            return address
-        return str(ipaddress.ip_network(f"{address}/64", strict=False))
+        parsed = ipaddress.ip_address(address)
+        if isinstance(parsed, ipaddress.IPv6Address):
+            return str(parsed.ipv4_mapped or ipaddress.ip_network((parsed, 64), strict=False))
+        return address
     except ValueError:
         return address
 

@@ -173,6 +173,20 @@ def test_addresses_of_one_ipv6_network_count_as_one(app: FastAPI, tokens: Tokens
     assert told == [401] * FAILURES_A_MINUTE + [429]
 
 
+def test_an_ipv4_address_in_the_clothes_of_ipv6_counts_as_itself(
+    app: FastAPI, tokens: Tokens
+) -> None:
+    """As a proxy may tell it: one guesser must not lock out all others of IPv4."""
+    good = tokens.create("ops", Role.ADMIN)
+    guesser = TestClient(app, base_url=FAR, client=("::ffff:192.0.2.7", 1))
+    for _ in range(FAILURES_A_MINUTE + 1):
+        told = guesser.get("/v1/jobs", headers=bearer("ops.guess")).status_code
+    assert told == 429
+    for address, status in (("::ffff:192.0.2.8", 200), ("192.0.2.7", 429)):
+        other = TestClient(app, base_url=FAR, client=(address, 1))
+        assert other.get("/v1/jobs", headers=bearer(good)).status_code == status
+
+
 def test_the_loopback_alone_goes_without_a_token(
     farm: Farm, tokens: Tokens, tmp_path: Path
 ) -> None:
