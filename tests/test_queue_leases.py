@@ -1,15 +1,15 @@
 """Leases and attempts, against a real Redis: who has a task, and how often it is tried."""
 
 import time
-from collections.abc import Callable
+from typing import cast
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis import Redis
 
-from pileus_service.jobs import Kind, Merged, Stale, Task, WorkerInfo
-from pileus_service.queue import Queue
+from pileus_service.jobs import Kind, Merged, Replan, Stale, Task, Waiting, WorkerInfo
+from pileus_service.queue import Queue, Verb
 from queueing import LEASE, A, B, C, D, do, lapse, submit, take, view, worker
 
 
@@ -155,54 +155,115 @@ def test_a_stale_plan_is_made_anew_a_bounded_number_of_times(queue: Queue) -> No
     assert queue.failed("job") == {0: "render failed: cloud.vdb changes"}
 
 
+FRAMES = {"one": 3, "two": 2, "three": 1}
+STEPS = {
+    **dict.fromkeys(("claim", "finish"), 5),
+    "fail": 3,
+    **dict.fromkeys(("hand back", "wait", "stale", "redo", "replan", "renew"), 1),
+    **dict.fromkeys(("lapse", "wake", "drain", "undrain", "leave"), 1),
+    **dict.fromkeys(("pause", "resume", "cancel", "retry", "priority", "remove"), 1),
+}
+
+
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@given(st.lists(st.tuples(st.sampled_from("ABC"), st.integers(0, 9)), max_size=60))
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([step for step, weight in STEPS.items() for _ in range(weight)]),
+            st.sampled_from("ABC"),
+            st.sampled_from(list(FRAMES)),
+            st.integers(0, 9),
+        ),
+        min_size=50,  # else most are of a handful
+        max_size=150,
+    )
+)
 def test_whatever_happens_every_frame_ends_and_nothing_is_left(
-    redis: Redis, steps: list[tuple[str, int]]
+    redis: Redis, steps: list[tuple[str, str, str, int]]
 ) -> None:
-    """Workers claim, finish, hand back, freeze and are taken for dead in any order."""
+    """Workers claim, finish, hand back, fail, freeze, leave and are taken for dead, while their
+    jobs are steered, in any order."""
     redis.flushall()
-    queue = Queue(redis, lease=0.1)
-    submit(queue, "one", frames=3)
-    submit(queue, "two", frames=2, priority=7)
-    held: dict[str, list[Task]] = {"A": [], "B": [], "C": []}
-    actions: dict[int, Callable[[Task, WorkerInfo], object]] = {
-        0: lambda task, info: queue.hand_back(task, info.name),
-        1: lambda task, info: queue.fail(task, info.name, "crash"),
-        2: lambda task, info: time.sleep(0.15),
-    }
-
-    def finish(task: Task, info: WorkerInfo) -> object:
-        return do(queue, task, info)
-
-    for name, action in steps:
-        info = worker(name)
-        if action == 9:
-            queue.control("one", "pause")
-            queue.control("one", "resume")
-        elif action == 8:
-            queue.control("one", "priority", len(held[name]) % 10)
-        elif held[name] and action < 7:
-            act = actions.get(action, finish)
-            act(held[name].pop(), info)
-        elif task := queue.claim(info):
-            held[name].append(task)
-    deadline = time.monotonic() + 30
-    while any(view(queue, job)[0] not in ("done", "failed") for job in ("one", "two")):
-        assert time.monotonic() < deadline, "the farm came to a stand"
+    queue = Queue(redis, lease=LEASE)
+    for job, frames in FRAMES.items():
+        submit(queue, job, frames)
+    held: dict[str, list[Task]] = {name: [] for name in "ABC"}
+    for step, name, job, number in steps:
+        if step == "claim":
+            if task := queue.claim(worker(name)):
+                held[name].append(task)
+        elif step in ("lapse", "wake"):
+            lapse(queue) if step == "lapse" else wake(queue)
+        elif step in ("drain", "undrain", "leave"):
+            getattr(queue, step)(name)
+        elif step in ("pause", "resume", "cancel", "retry", "priority", "remove"):
+            if queue.control(job, cast(Verb, step), number) == "removed" and number:
+                submit(queue, job, FRAMES[job])
+        elif held[name]:
+            task = held[name].pop(number % len(held[name]))
+            end_attempt(queue, step, task, worker(name), number)
+    jobs = [job for job in FRAMES if queue.control(job, "resume")]
+    for name in "ABC":
+        queue.undrain(name)
+    rounds = 0
+    while any(queue.state(job) == "running" for job in jobs):
         if task := queue.claim(D):
             do(queue, task, D)
         else:
-            time.sleep(0.005)
-    time.sleep(0.15)
+            rounds += 1
+            assert rounds < 200, "the farm came to a stand"
+            wake(queue)
+            lapse(queue)
+    for name, tasks in held.items():
+        for task in tasks:
+            do(queue, task, worker(name))
+    lapse(queue)
     assert queue.claim(D) is None
     assert all(depth == (0, 0) for depth in queue.depths().values())
-    for job in ("one", "two"):
+    for left in ("frame:*", "held", "ready", "active", "waiting", "flight"):
+        assert not list(redis.scan_iter(f"pileus:job:*:{left}"))
+    assert not list(redis.scan_iter("pileus:tasks:*:tries:*"))
+    assert not list(redis.scan_iter("pileus:ring:*"))
+    assert not redis.exists("pileus:due")
+    for job in jobs:
         seen = queue.job(job)
         assert seen is not None
-        assert seen.frames_done + seen.frames_failed == seen.frames
+        done, failed = queue.done(job), queue.failed_frames(job)
+        assert (seen.frames_done, seen.frames_failed) == (len(done), len(failed))
+        assert not done & failed
+        assert seen.state == "cancelled" or len(done | failed) == seen.frames
+
+
+def wake(queue: Queue) -> None:
+    """The time comes of every frame that waits for its cache."""
+    for member in cast(list[str], queue.redis.zrange("pileus:due", 0, -1)):
+        queue.redis.zadd("pileus:due", {member: 0})
+    queue.redis.delete("pileus:clock")
+
+
+def end_attempt(queue: Queue, how: str, task: Task, info: WorkerInfo, number: int) -> None:
+    """What may come of an attempt; what can come of no task of its kind is done instead."""
+    planning, merging = task.kind is Kind.PLAN, task.kind is Kind.MERGE
+    if how == "hand back":
+        queue.hand_back(task, info.name)
+    elif how == "fail":
+        queue.fail(task, info.name, "crash")
+    elif how == "renew":
+        queue.renew(task, info.model_copy(update={"task": task, "samples": number}))
+    elif how == "stale":
+        queue.complete(task, info.name, Stale(stale="changed"))
+    elif how == "wait" and planning:
+        queue.complete(task, info.name, Waiting(wait="not there yet"))
+    elif how == "replan" and not planning:
+        queue.complete(task, info.name, Replan())
+    elif how == "redo" and merging:
+        tasks = int(queue.redis.hget(f"pileus:job:{task.job}:frame:{task.frame}", "tasks") or 0)
+        redo = list(range(number % (tasks + 1)))
+        queue.complete(task, info.name, Merged(redo=redo, reason="damaged"))
+    else:
+        do(queue, task, info, tasks=number % 4)
 
 
 @pytest.mark.parametrize("how", ["done", "failed", "handed back", "renewed"])
