@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import resource
 import socket
 from pathlib import Path
 
@@ -48,6 +49,9 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
         guard = guard_for(host, data)
     except OSError as error:
         raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
+    # Each caller costs a file, whether or not it says anything: as many as the system gives.
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     app = create_app(Farm(store, Queue(connect(redis_url)), Roots(roots, data)), guard)
     # Watchers hold their connections open: they are not waited for at the end.
     config = uvicorn.Config(

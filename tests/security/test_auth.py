@@ -1,9 +1,11 @@
 """Who gets in: every route against every kind of caller, and what is kept and told of tokens."""
 
+import contextlib
 import hashlib
 import json
 import os
 import re
+import resource
 import socket
 import subprocess
 import sys
@@ -359,6 +361,33 @@ def test_a_real_service_takes_tokens_as_they_come_and_logs_none(
     for file in [log, *(path for path in data.rglob("*") if path.is_file())]:
         text = file.read_text()
         assert not [secret for secret in (*secrets, "redispassword") if secret in text], file
+
+
+def test_callers_who_say_nothing_keep_nobody_out(
+    tmp_path: Path, redis: Redis, private_redis: PrivateRedis
+) -> None:
+    """Each costs a file, of which a program has at first far fewer than the system would give."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    files, most = 256, resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    process = subprocess.Popen(
+        service(tmp_path / "data", f"127.0.0.1:{port}", private_redis.url),
+        cwd=tmp_path,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (files, most)),
+    )
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+            for attempt in Retrying(stop=stop_after_delay(60), wait=wait_fixed(0.1)):
+                with attempt:
+                    client.get("/healthz")
+        with contextlib.ExitStack() as silent:
+            for _ in range(files):
+                silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+            answer = httpx.get(f"http://127.0.0.1:{port}/v1/jobs", timeout=10)
+            assert answer.status_code == 200
+    finally:
+        process.terminate()
+        process.wait(20)
 
 
 def test_a_worker_that_redis_refuses_logs_no_password(
