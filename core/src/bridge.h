@@ -45,14 +45,26 @@ class Chain {
   public:
     Chain(const LightSample& light, const HenyeyGreenstein& phase, int length, Random random)
         : light_(light) {
+        std::array<float, longest_bridge> u1{}, u2{};
+        for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
+            const auto pair = random.pair();
+            u1[i] = pair[0];
+            u2[i] = pair[1];
+        }
+        // All deflections at once; which way each leads hangs on those before.
+        for (std::size_t i = 0; i < longest_bridge; ++i) {
+            const auto [direction, inverse_density] = phase.deflection(u1[i], u2[i]);
+            direction_[0][i] = direction.x;
+            direction_[1][i] = direction.y;
+            direction_[2][i] = direction.z;
+            inverse_[i] = inverse_density;
+        }
         V3f next = light.direction;
         float sum = 0.0f;
         for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
-            const auto [u1, u2] = random.pair();
-            const auto [direction, inverse_density] = phase.sample(next, u1, u2);
-            for (int axis = 0; axis < 3; ++axis) direction_[axis][i] = direction[axis];
-            inverse_[i] = sum += inverse_density;
-            next = direction;
+            next = phase.turned(next, V3f(direction_[0][i], direction_[1][i], direction_[2][i]));
+            for (int axis = 0; axis < 3; ++axis) direction_[axis][i] = next[axis];
+            inverse_[i] = sum += inverse_[i];
         }
     }
 

@@ -72,6 +72,12 @@ class ShadowRay {
 
 namespace {
 
+bool has_directions(const std::shared_ptr<const Light>& light) {
+    return light->sample(0.5f, 0.5f).has_value();
+}
+
+bool takes_bridges(const std::shared_ptr<const Light>& light) { return !light->can_be_hit(); }
+
 /// The chance with which light is asked for that would count `brightness` times as much as it does
 /// under an isotropic phase function: most directions lie far off the phase function's peak. b has
 /// no say, so that it can be regraded.
@@ -89,7 +95,12 @@ DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
       tracked_(flights == Flights::tracked),
       all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
                                         [](const Look& look) { return look.physical(); })),
-      reach_(tracked_ ? bridge_length(scene.medium.phase().g()) : 0) {
+      asks_(!all_walk_ || std::any_of(scene.lights.begin(), scene.lights.end(), has_directions)),
+      reach_(tracked_ && std::any_of(scene.lights.begin(), scene.lights.end(), takes_bridges)
+                 ? bridge_length(scene.medium.phase().g())
+                 : 0),
+      early_(events_within(4.0f)),
+      bridged_(reach_ > 0 ? std::min(schedule.plain(), events_within(20.0f)) : 0) {
     constexpr int kept = 64;
     for (int n = 0; n < kept; ++n) {
         for (std::size_t look = 0; look < looks.size(); ++look)
@@ -110,6 +121,7 @@ DirectLight::Term DirectLight::make_term(std::size_t look, int n) const {
 
 void DirectLight::ask(const ScatterEvent& event, int first, int last, const PathRandom& random,
                       ShadowRays& rays) const {
+    if (!asks_) return;
     const HenyeyGreenstein& phase = schedule_.at(first).phase();
     const Medium& onward = schedule_.onward(first);
     const Lobe lobe(phase, last > 1);
@@ -117,9 +129,9 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
     const float roulette = first == 0 ? 0.0f : event_stream.uniform();
     // A path has one first event, few early ones and many later ones: what their shadows' noise
     // counts falls, and the time it takes to have less of it grows.
-    const float rate = first == 0 ? 3.0f : early(first) ? 1.5f : 1.0f;
+    const float rate = first == 0 ? 3.0f : first < early_ ? 1.5f : 1.0f;
     const auto asked = [&](float brightness) {
-        return first == 0 ? 1.0f : chance(brightness, early(first));
+        return first == 0 ? 1.0f : chance(brightness, first < early_);
     };
 
     for (const auto& light : scene_.lights) {
@@ -135,7 +147,7 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
             const float lobe_density =
                 hit ? lobe.density(event.direction, sample->direction) : 0.0f;
             float others = 0.0f;  // the inverse densities that the bridges weigh in
-            if (!hit && bridged(first)) {
+            if (!hit && first < bridged_) {
                 others = event.choices.inverse(reach_);
             }
             ShadowRay ray(rays, onward, event.position, sample->direction, rate, stream);
@@ -177,7 +189,9 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
 
 void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
                               Bridges& bridges) const {
-    if (n + 1 >= end || !bridged(n + 1)) return;
+    const int most = std::min(reach_, std::min(end, bridged_) - 1 - n);  // events of a bridge
+    if (most < 1) return;
+    const float brightness = (n == 0 ? 4.0f : 2.0f) * pi;
     const HenyeyGreenstein& phase = schedule_.at(n).phase();
     Random event_stream = random.stream(bridge_stream, static_cast<std::uint64_t>(n));
     for (std::size_t k = 0; k < scene_.lights.size(); ++k) {
@@ -187,12 +201,11 @@ void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const P
         const auto inverses = way->inverses(phase, event.direction);
         // Systematic sampling (Madow 1949): one number decides on all lengths.
         float until_taken = event_stream.uniform();
-        for (int length = 1; length <= reach_ && n + length < end && bridged(n + length);
-             ++length) {
+        for (int length = 1; length <= most; ++length) {
             // Of all choices of which a bridge leaves one to be evaluated.
             const float inverse = inverses[static_cast<std::size_t>(length - 1)] +
                                   event.choices.inverse(reach_ - length);
-            const float odds = chance((n == 0 ? 4.0f : 2.0f) * pi / inverse, early(n));
+            const float odds = chance(brightness / inverse, n < early_);
             until_taken -= odds;
             if (until_taken >= 0.0f) continue;
             until_taken += 1.0f;
@@ -245,8 +258,8 @@ void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
         }
         const LightSample& light = bridge.chain->light();
         const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
-        ShadowRay ray(rays, schedule_.onward(n), position, light.direction, early(n) ? 2.0f : 1.0f,
-                      flown.random);
+        ShadowRay ray(rays, schedule_.onward(n), position, light.direction,
+                      n < early_ ? 2.0f : 1.0f, flown.random);
         for_terms(n, n + 1, [&](const Term& term) {
             const float scattered =
                 term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
@@ -257,21 +270,10 @@ void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
     bridges.under_way_.erase(kept, bridges.under_way_.end());
 }
 
-/// Whether event n comes before a walk has lost its direction, four transport mean free paths along
-/// it: what those events see of the light differs from pixel to pixel the most, and is worth more
-/// work.
-bool DirectLight::early(int n) const { return transport_lengths(n) < 4.0f; }
-
-/// Whether light of event n's order also comes by bridges: where its lobe, and so those of the
-/// events before it, is the medium's own and narrow, and until so many events have passed that
-/// what any one of them sees counts little.
-bool DirectLight::bridged(int n) const {
-    return reach_ > 0 && schedule_.plain(n) && transport_lengths(n) < 20.0f;
-}
-
-/// How many transport mean free paths a walk has gone by event n.
-float DirectLight::transport_lengths(int n) const {
-    return static_cast<float>(n) * (1.0f - scene_.medium.phase().g());
+/// How many events of a walk come, on the mean, before it has gone so many transport mean free
+/// paths.
+int DirectLight::events_within(float transport_lengths) const {
+    return static_cast<int>(std::ceil(transport_lengths / (1.0f - scene_.medium.phase().g())));
 }
 
 void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density,

@@ -130,14 +130,13 @@ class DirectLight {
         for (std::size_t look = 0; look < looks_.size(); ++look) {
             for (int n = first; n < last; ++n) {
                 const std::size_t i = static_cast<std::size_t>(n) * looks_.size() + look;
-                visit(i < terms_.size() ? terms_[i] : make_term(look, n));
+                std::optional<Term> late;
+                visit(i < terms_.size() ? terms_[i] : late.emplace(make_term(look, n)));
             }
         }
     }
 
-    float transport_lengths(int n) const;
-    bool early(int n) const;
-    bool bridged(int n) const;
+    int events_within(float transport_lengths) const;
     const std::optional<Chain>& chain(Bridges& bridges, std::size_t light, int n,
                                       const PathRandom& random) const;
     Track flight(const V3f& position, const V3f& direction, int n, Random random) const;
@@ -147,7 +146,19 @@ class DirectLight {
     const std::vector<Look>& looks_;
     bool tracked_;
     bool all_walk_;
-    int reach_;                // the most events of a bridge; 0 where there are none
+    bool asks_;  // whether any light is left to ask for at an event
+    int reach_;  // the most events of a bridge; 0 where there are none
+
+    // Events before this one come before a walk has lost its direction, four transport mean free
+    // paths along it: what they see of the light differs from pixel to pixel the most, and is worth
+    // more work.
+    int early_;
+
+    // Light of these events' orders also comes by bridges: where their lobe, and so those of the
+    // events before, is the medium's own and narrow, and until so many have passed that what any
+    // one of them sees counts little.
+    int bridged_;
+
     std::vector<Term> terms_;  // of the first events, all looks of one after the other
 };
 

@@ -25,7 +25,7 @@ class DistantLight final : public Light {
 
     std::optional<LightSample> sample(float u1, float u2) const override {
         if (density_ == 0.0f) return LightSample{towards_, radiance_, 0.0f};
-        const V3f direction = direction_about(towards_, u1 * one_minus_cos_, u2);
+        const V3f direction = turned_to(towards_, from_pole(u1 * one_minus_cos_, u2));
         return LightSample{direction, radiance_ / density_, density_};
     }
 

@@ -6,9 +6,10 @@
 #include <Imath/ImathVec.h>
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
+#include <cstdint>
 #include <numbers>
-#include <utility>
 
 namespace pileus {
 
@@ -28,28 +29,35 @@ inline void make_frame(const V3f& w, V3f& u, V3f& v) {
     v = V3f(b, sign + w.y * w.y * a, -w.y);
 }
 
-/// Sine and cosine of so many turns, in [0, 1], to two units in the last place of 1.
-inline std::pair<float, float> sine_cosine(float turns) {
-    // About the nearest quarter turn, by Taylor's series; then as many quarters further.
-    const float quarters = 4.0f * turns;
-    const int quarter = static_cast<int>(quarters + 0.5f);
-    const float x = (quarters - static_cast<float>(quarter)) * (0.5f * pi);
+/// The sine of so many turns, in [-1, 1], to two units in the last place of 1. Without a branch, so
+/// that compilers can take several at once.
+inline float sine(float turns) {
+    // About the nearest half turn, by Taylor's series.
+    const int half = static_cast<int>(2.0f * turns + 2.5f) - 2;
+    const float x = (turns - 0.5f * static_cast<float>(half)) * (2.0f * pi);
     const float z = x * x;
-    const float sine =
-        x * (1.0f + z * (-1.0f / 6 + z * (1.0f / 120 + z * (-1.0f / 5040 + z / 362880))));
-    const float cosine = 1.0f + z * (-1.0f / 2 + z * (1.0f / 24 + z * (-1.0f / 720 + z / 40320)));
-    const float along = quarter & 1 ? cosine : sine, across = quarter & 1 ? sine : cosine;
-    return {quarter & 2 ? -along : along, (quarter + 1) & 2 ? -across : across};
+    const float value =
+        x * (1.0f + z * (-1.0f / 6 + z * (1.0f / 120 + z * (-1.0f / 5040 +
+                                                            z * (1.0f / 362880 - z / 39916800)))));
+    return std::bit_cast<float>(std::bit_cast<std::uint32_t>(value) ^
+                                static_cast<std::uint32_t>(half) << 31);
 }
 
-/// The unit vector at angle theta from the unit vector w and so many turns about it, given 1 -
-/// cos(theta): that difference, unlike the cosine, keeps its precision for small angles.
-inline V3f direction_about(const V3f& w, float one_minus_cos, float turns) {
+inline float cosine(float turns) { return sine(0.25f - turns); }
+
+/// The unit vector at angle theta from the z axis and so many turns about it, given 1 - cos(theta):
+/// that difference, unlike the cosine, keeps its precision for small angles.
+inline V3f from_pole(float one_minus_cos, float turns) {
+    // Rounding may have left the difference a little over 2.
+    const float radius = std::sqrt(std::max(0.0f, one_minus_cos * (2.0f - one_minus_cos)));
+    return {radius * cosine(turns), radius * sine(turns), 1.0f - one_minus_cos};
+}
+
+/// A unit vector, turned as the z axis would have to be to become the unit vector w.
+inline V3f turned_to(const V3f& w, const V3f& direction) {
     V3f u, v;
     make_frame(w, u, v);
-    const float radius = std::sqrt(std::max(0.0f, one_minus_cos * (2.0f - one_minus_cos)));
-    const auto [sine, cosine] = sine_cosine(turns);
-    const V3f d = w * (1.0f - one_minus_cos) + u * (radius * cosine) + v * (radius * sine);
+    const V3f d = w * direction.z + u * direction.x + v * direction.y;
     // So close to length 1 that a step of Newton's method makes it so. Without it a long walk's
     // errors would add up.
     return d * (1.5f - 0.5f * d.length2());

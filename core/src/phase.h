@@ -34,16 +34,25 @@ class HenyeyGreenstein {
         float inverse_density;
     };
 
-    /// A direction drawn from `density`, from u1, u2 in [0, 1): the inversion of the distribution,
-    /// rearranged so that nothing cancels and g = 0 needs no case.
+    /// A direction drawn from `density`, from u1, u2 in [0, 1).
     Sample sample(const V3f& in, float u1, float u2) const {
+        const auto [direction, inverse_density] = deflection(u1, u2);
+        return {turned(in, direction), inverse_density};
+    }
+
+    /// The same about the z axis, for light that came along it if g >= 0 and against it if not: the
+    /// inversion of the distribution, rearranged so that nothing cancels and g = 0 needs no case.
+    Sample deflection(float u1, float u2) const {
         const float g = std::abs(g_);
         const float ratio = (1.0f - g) / (1.0f - g + 2.0f * g * u1);
-        const float one_minus_cos =
-            std::min(2.0f, 2.0f * (1.0f - u1) * (1.0f + g * u1) * ratio * ratio);
+        const float one_minus_cos = 2.0f * (1.0f - u1) * (1.0f + g * u1) * ratio * ratio;
         const float root = (1.0f + g) * ratio;  // of 1 + g^2 - 2 g cos(theta)
-        return {direction_about(g_ >= 0.0f ? in : -in, one_minus_cos, u2),
-                scale_ * root * root * root};
+        return {from_pole(one_minus_cos, u2), scale_ * root * root * root};
+    }
+
+    /// A deflection, of light that came along `in`.
+    V3f turned(const V3f& in, const V3f& deflected) const {
+        return turned_to(g_ >= 0.0f ? in : -in, deflected);
     }
 
   private:

@@ -13,7 +13,7 @@ Schedule::Schedule(const Medium& medium) : media_{medium}, order_{0.0f} {}
 Schedule::Schedule(const Medium& medium, int from) : media_{medium}, order_{0.0f} {
     const float g = medium.phase().g();
     if (g <= 0.0f) return;
-    from_ = from - 1;
+    plain_ = from;
     media_.assign(static_cast<std::size_t>(from - 1), medium);
     for (float reduced = g; reduced > 0.0f;) {
         reduced = std::max(0.0f, 2.0f * reduced - 1.0f);

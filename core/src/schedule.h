@@ -31,8 +31,8 @@ class Schedule {
     /// regraded).
     int order(int n) const;
 
-    /// Whether event n is met in the medium itself.
-    bool plain(int n) const { return n <= from_; }
+    /// How many events are met in the medium itself, at the most.
+    int plain() const { return plain_; }
 
     /// How many events have orders below a bound.
     int events(int orders) const;
@@ -47,7 +47,7 @@ class Schedule {
     std::vector<Medium> media_;  // beyond each event; the last for all further ones
     std::vector<float> order_;   // of each event; further ones follow at a steady pace
     float pace_ = 1.0f;
-    int from_ = std::numeric_limits<int>::max();
+    int plain_ = std::numeric_limits<int>::max();
 };
 
 }  // namespace pileus
