@@ -25,10 +25,10 @@ Camera::Camera(const V3d& position, const V3d& look_at, const V3d& up, double fo
     half_width_ = std::tan(0.5 * fov * std::numbers::pi / 180.0);
 }
 
-V3d Camera::direction(double x, double y, int width, int height) const {
-    const double u = (2.0 * x / width - 1.0) * half_width_;
-    const double v = (1.0 - 2.0 * y / height) * half_width_ * height / width;
-    return (forward_ + right_ * u + up_ * v).normalized();
+ImagePlane Camera::image_plane(int width, int height) const {
+    const double pixel = 2.0 * half_width_ / width;
+    return {forward_ - right_ * half_width_ + up_ * (0.5 * pixel * height), right_ * pixel,
+            -up_ * pixel};
 }
 
 Imath::M44d Camera::world_to_camera() const {

@@ -6,6 +6,14 @@
 
 namespace pileus {
 
+/// The points of an image in the plane at distance 1 before a camera, seen from it.
+struct ImagePlane {
+    V3d corner, across, down;  // the upper left corner, and the ways to the next pixels
+
+    /// `x` and `y` in pixels from the upper left corner.
+    V3d at(double x, double y) const { return corner + across * x + down * y; }
+};
+
 class Camera {
   public:
     /// `fov` is horizontal, in degrees. Throws InputError where these make no view.
@@ -14,8 +22,7 @@ class Camera {
     const V3d& position() const { return position_; }
     const V3d& forward() const { return forward_; }
 
-    /// The unit direction through a point of the image, in pixels from its upper left corner.
-    V3d direction(double x, double y, int width, int height) const;
+    ImagePlane image_plane(int width, int height) const;
 
     /// Both as OpenEXR's standard attributes define them (ImfStandardAttributes.h): camera space is
     /// left-handed with +z ahead; NDC runs from (0, 0), upper left, to (1, 1). Row vectors.

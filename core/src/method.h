@@ -2,6 +2,7 @@
 // marches and the tracking; a new one is a file under methods/ and a line in method.cpp.
 #pragma once
 
+#include "camera_rays.h"
 #include "direct_light.h"
 #include "path_in_flight.h"
 

@@ -1,5 +1,6 @@
 #include "render.h"
 
+#include "camera_rays.h"
 #include "error.h"
 
 #include <tbb/blocked_range2d.h>
@@ -192,6 +193,7 @@ Partial render(const Scene& scene, const Transport& transport, const RenderTask&
     partial.samples = task.samples;
     partial.image = LayeredImage(task.bucket, looks, channel_names(task.orders ? orders : 0));
 
+    const CameraRays rays(scene);
     const std::uint64_t frame_key =
         hash_key(hash_key(0, task.seed), static_cast<std::uint64_t>(task.frame));
     std::atomic<std::int64_t> bounded{0};
@@ -223,8 +225,7 @@ Partial render(const Scene& scene, const Transport& transport, const RenderTask&
             const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample));
             work.samples.push_back(
                 {pixel, sample + 1 == task.samples.last,
-                 scene.camera_ray(x + double{random.first[0]}, y + double{random.first[1]}),
-                 random});
+                 rays.through(x + double{random.first[0]}, y + double{random.first[1]}), random});
             if (work.samples.size() == work.most) settle(work);
         }
     };

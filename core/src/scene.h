@@ -39,14 +39,6 @@ struct Transport {
     int reduce_from = 3;  // `similarity`: the first event that a reduced medium leads to
 };
 
-/// A ray through a point of the image: where it enters the volume's box, if it does.
-struct CameraRay {
-    V3f direction;  // world, unit
-    std::optional<LocalRay> volume;
-    double entry_distance;      // world units from the camera to the local ray's origin
-    double depth_per_distance;  // along the view axis
-};
-
 struct Scene {
     std::shared_ptr<const Volume> volume;
     Medium medium;
@@ -54,8 +46,6 @@ struct Scene {
     std::vector<std::shared_ptr<const Light>> lights;
     int width, height;
     bool background;  // whether rays that leave the volume see the domes
-
-    CameraRay camera_ray(double x, double y) const;
 
     /// What a ray sees beyond the volume.
     Color sky(const V3f& direction) const;

@@ -1,5 +1,6 @@
 // What must be equal whatever the order of the work: methods that coincide, looks together and
 // alone, recombined orders, buckets, and threads.
+#include "camera_rays.h"
 #include "error.h"
 #include "support.h"
 
@@ -179,6 +180,7 @@ TEST(Scene, BucketsThatTheVolumeCannotTouchSeeOnlySky) {
         const Camera camera(position, look_at, V3d(0.1, 1.0, 0.2), 20.0 + 140.0 * random.uniform());
         const Scene scene = test::make_scene(volume, camera, {test::constant_dome()},
                                              {50.0f, Color(0.0f), 0.0f, 64, 64});
+        const CameraRays rays(scene);
         for (int y = 0; y < 64; y += 16) {
             for (int x = 0; x < 64; x += 16) {
                 const Bucket bucket{x, y, x + 16, y + 16};
@@ -186,7 +188,7 @@ TEST(Scene, BucketsThatTheVolumeCannotTouchSeeOnlySky) {
                 ++untouched;
                 for (int sub = 0; sub <= 64; ++sub) {
                     for (int row = 0; row <= 64; row += 4) {
-                        ASSERT_FALSE(scene.camera_ray(x + sub / 4.0, y + row / 4.0).volume);
+                        ASSERT_FALSE(rays.through(x + sub / 4.0, y + row / 4.0).volume);
                     }
                 }
             }

@@ -2,6 +2,7 @@
 // and `density` share it.
 #pragma once
 
+#include "../camera_rays.h"
 #include "../march.h"
 #include "../path.h"
 #include "../scene.h"
