@@ -52,6 +52,9 @@ class Medium {
     const Color& albedo() const { return albedo_; }
     const HenyeyGreenstein& phase() const { return phase_; }
 
+    /// Of directions of the world, as row vectors.
+    const Imath::M33f& to_local() const { return to_local_; }
+
     /// A ray from a local position along a unit vector of the world.
     LocalRay ray(const V3f& local_position, const V3f& world_direction) const {
         return {local_position, world_direction * to_local_};

@@ -16,6 +16,7 @@ class HenyeyGreenstein {
         : g_(g), scale_(4.0f * pi / ((1.0f - std::abs(g)) * (1.0f + std::abs(g)))) {}
 
     float g() const { return g_; }
+    float scale() const { return scale_; }  // 4 pi / (1 - g^2)
 
     /// Probability density per steradian of leaving along `out` having come along `in`.
     float density(const V3f& in, const V3f& out) const { return 1.0f / inverse_density(in, out); }
@@ -57,7 +58,7 @@ class HenyeyGreenstein {
 
   private:
     float g_;
-    float scale_;  // 4 pi / (1 - g^2)
+    float scale_;
 };
 
 }  // namespace pileus

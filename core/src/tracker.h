@@ -29,16 +29,25 @@ enum class Estimator {
     transmittance,
 };
 
+/// A scatter event: how light goes on from there is drawn as its ray is tracked, also many at once.
+struct Turn {
+    const HenyeyGreenstein* phase;
+    V3f arriving;  // world, unit
+    float u1, u2;  // of which the direction is drawn, uniform in [0, 1)
+    HenyeyGreenstein::Sample onward{};
+};
+
 /// A ray, and what tracking has found along it.
 struct Track {
     static constexpr float none = std::numeric_limits<float>::infinity();
 
     const Medium* medium;
     LocalRay ray;
-    Random random;       // goes on where tracking has left it
-    float first;         // of which the first free flight is drawn, uniform in [0, 1)
-    float power = 1.0f;  // of the transmittance
-    float rate = 1.0f;   // of collisions, over the majorant; at least 1. More of them, less noise
+    Turn* turn = nullptr;  // of which the ray's direction comes, if there is one
+    Random random;         // goes on where tracking has left it
+    float first;           // of which the first free flight is drawn, uniform in [0, 1)
+    float power = 1.0f;    // of the transmittance
+    float rate = 1.0f;     // of collisions, over the majorant; at least 1. More of them, less noise
     float distance = none;  // of the collision; none where the ray leaves the medium
     // Of a forced collision: an unbiased estimate of 1 - T, in [0, 1]. Of transmittance: that.
     float weight = 0.0f;
@@ -59,6 +68,13 @@ class Tracker {
         waiting_[static_cast<std::size_t>(estimator)].push_back(&track);
     }
 
+    /// The same for a flight to the next collision, in a direction that is drawn. The turn, too,
+    /// must stay.
+    void add(Turn& turn, Track& flight) {
+        flight.turn = &turn;
+        turning_.push_back(&flight);
+    }
+
     /// Follows all rays that were laid down. What is found along one does not depend on the others,
     /// nor on the width.
     void run();
@@ -68,6 +84,7 @@ class Tracker {
     Boxes boxes_;
     void (*follow_)(Estimator, const BrickTree&, Boxes, std::span<Track* const>);
     std::array<std::vector<Track*>, 3> waiting_;  // by estimator
+    std::vector<Track*> turning_;
 };
 
 }  // namespace pileus

@@ -238,6 +238,47 @@ TEST_P(TrackerTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
     }
 }
 
+TEST_F(TrackingTest, RaysTurnAsThePhaseFunctionDoesAlone) {
+    // Also along the axes, where the frame's formulas have their corners.
+    std::vector<V3f> ways = {V3f(0, 0, 1), V3f(0, 0, -1), V3f(1, 0, 0), V3f(0, -1, 0)};
+    Random random(7);
+    while (ways.size() < 50) {
+        const auto coordinate = [&] { return 2.0f * random.uniform() - 1.0f; };
+        const V3f way(coordinate(), coordinate(), coordinate());
+        if (way.length() > 0.1f) ways.push_back(way.normalized());
+    }
+    for (const float g : {-0.999f, -0.3f, 0.0f, 0.85f, 0.9999f}) {
+        const HenyeyGreenstein phase(g);
+        for (const int width : Tracker::widths()) {
+            Tracker tracker(volume_->tree(), Boxes::bricks, width);
+            const Track from{.medium = &*medium_,
+                             .ray = {V3f(0.5f), V3f(0.0f)},
+                             .random = Random(1),
+                             .first = 0.5f};
+            std::vector<Track> straight(ways.size(), from), turning(ways.size(), from);
+            std::vector<Turn> turns;
+            for (std::size_t i = 0; i < ways.size(); ++i) {
+                const float u1 = i % 7 == 0 ? 0.0f : random.uniform();
+                turns.push_back({&phase, ways[i], u1, i % 11 == 0 ? 0.0f : random.uniform()});
+            }
+            for (std::size_t i = 0; i < ways.size(); ++i) {
+                straight[i].ray.direction = ways[i];
+                tracker.add(Estimator::collision, straight[i]);
+                tracker.add(turns[i], turning[i]);
+            }
+            tracker.run();
+            for (std::size_t i = 0; i < ways.size(); ++i) {
+                const auto [direction, inverse_density] =
+                    phase.sample(ways[i], turns[i].u1, turns[i].u2);
+                EXPECT_EQ(turns[i].onward.direction, direction) << g << " " << ways[i];
+                EXPECT_EQ(turns[i].onward.inverse_density, inverse_density);
+                EXPECT_EQ(turning[i].ray.direction, medium_->ray(V3f(0.0f), direction).direction);
+                EXPECT_EQ(straight[i].ray.direction, ways[i]);
+            }
+        }
+    }
+}
+
 TEST_F(TrackingTest, TheMarchSumsTheOpticalDepthWithoutBias) {
     // Over its jitter, the march's depth has the exact depth as its mean; at many stratified
     // jitters the sum is a fine quadrature.

@@ -44,14 +44,11 @@ class Tracked final : public Method {
             light_.ask(event, n, n + 1, random, shadows);
             light_.ask_bridges(event, n, events_, random, bridges);
             const auto [u1, u2, u3] = random.onward(n, walk);
-            const auto [direction, inverse_density] =
-                schedule_.at(n).phase().sample(event.direction, u1, u2);
             const Medium& medium = schedule_.onward(n);
-            Track flight{.medium = &medium,
-                         .ray = medium.ray(event.position, direction),
-                         .random = walk,
-                         .first = u3};
-            tracker.add(Estimator::collision, flight);
+            Turn turn{&schedule_.at(n).phase(), event.direction, u1, u2};
+            Track flight{
+                .medium = &medium, .ray = {event.position, V3f(0.0f)}, .random = walk, .first = u3};
+            tracker.add(turn, flight);
             do {
                 shadows.cast(tracker);
                 bridges.cast(tracker);
@@ -59,6 +56,7 @@ class Tracked final : public Method {
                 shadows.settle(record);
                 light_.go_on(bridges, shadows);
             } while (!shadows.empty() || !bridges.empty());
+            const auto& [direction, inverse_density] = turn.onward;
             if (flight.distance == Track::none) {
                 light_.add_escape(event, direction, inverse_density, n, record);
                 co_return;
