@@ -36,13 +36,13 @@ class Lobe {
 class ShadowRay {
   public:
     ShadowRay(ShadowRays& rays, const Medium& medium, const V3f& position, const V3f& direction,
-              float rate, Random random)
+              float rate, float first, Random random)
         : rays_(rays),
           medium_(medium),
           position_(position),
           direction_(direction),
           rate_(rate),
-          first_(random.uniform()),
+          first_(first),
           random_(random) {}
 
     /// Light for the record, less what is lost on the way.
@@ -134,8 +134,11 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
         return first == 0 ? 1.0f : chance(brightness, first < early_);
     };
 
+    float shadow = first == 0 ? random.light()[2] : event.shadow;
     for (const auto& light : scene_.lights) {
         Random stream(event_stream.bits());
+        // Lights share the number, each turned on from the last (Cranley & Patterson 1976).
+        shadow += shadow < 0.382f ? 0.618f : -0.382f;
         const bool hit = light->can_be_hit();
         // The light's own directions ...
         const auto numbers = [&](Random& from) {
@@ -150,7 +153,7 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
             if (!hit && first < bridged_) {
                 others = event.choices.inverse(reach_);
             }
-            ShadowRay ray(rays, onward, event.position, sample->direction, rate, stream);
+            ShadowRay ray(rays, onward, event.position, sample->direction, rate, shadow, stream);
             for_terms(first, last, [&](const Term& term) {
                 const float rival = hit ? (term.walk ? seen : lobe_density) : 0.0f;
                 const float share = rival > 0.0f ? sample->density / (sample->density + rival)
@@ -175,7 +178,8 @@ void DirectLight::ask(const ScatterEvent& event, int first, int last, const Path
         const float density = lobe.density(event.direction, direction) + light->density(direction);
         const Color radiance = light->radiance(direction);
         if (!(density > 0.0f) || radiance == Color(0.0f)) continue;
-        ShadowRay ray(rays, onward, event.position, direction, rate, lobe_stream);
+        const float u = lobe_stream.uniform();
+        ShadowRay ray(rays, onward, event.position, direction, rate, u, lobe_stream);
         for_terms(first, last, [&](const Term& term) {
             if (term.walk) return;
             const float scattered = term.phase.density(event.direction, direction) / density;
@@ -258,8 +262,9 @@ void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
         }
         const LightSample& light = bridge.chain->light();
         const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
+        const float u = flown.random.uniform();
         ShadowRay ray(rays, schedule_.onward(n), position, light.direction,
-                      n < early_ ? 2.0f : 1.0f, flown.random);
+                      n < early_ ? 2.0f : 1.0f, u, flown.random);
         for_terms(n, n + 1, [&](const Term& term) {
             const float scattered =
                 term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;

@@ -36,21 +36,20 @@ class PathRandom {
     /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
     const Point first;
 
-    /// At the first event: the direction towards a light. Many paths have none.
+    /// At the first event: the direction towards a light, and the shadow ray's first flight. Many
+    /// paths have none.
     const Point& light() const {
         if (!light_) light_ = stratified(light_points);
         return *light_;
     }
 
-    /// With what a walk goes on from event n: two numbers for the direction and one for the flight.
-    /// For its first events they are stratified.
-    std::array<float, 3> onward(int n, Random& walk) const {
-        if (n >= 3) {
-            const auto [u1, u2] = walk.pair();
-            return {u1, u2, walk.uniform()};
-        }
-        const Point point = stratified(walk_points + static_cast<std::uint64_t>(n));
-        return {point[0], point[1], point[2]};
+    /// With what a walk goes on from event n: two numbers for the direction, one for the flight and
+    /// one for the next event's shadow. For its first events they are stratified.
+    Point onward(int n, Random& walk) const {
+        if (n < 3) return stratified(walk_points + static_cast<std::uint64_t>(n));
+        const auto [u1, u2] = walk.pair();
+        const auto [u3, u4] = walk.pair();
+        return {u1, u2, u3, u4};
     }
 
     Random stream(StreamPurpose purpose, std::uint64_t index = 0) const {
@@ -112,6 +111,7 @@ struct ScatterEvent {
     V3f direction;            // world, unit: the way the walk arrived
     Color weight;             // of the path up to here, this event's albedo included
     RecentChoices choices{};  // of the directions up to here
+    float shadow = 0.0f;      // the number for its shadow, where it is not the first
 };
 
 }  // namespace pileus

@@ -43,11 +43,13 @@ class Tracked final : public Method {
         for (int n = 0;; ++n) {
             light_.ask(event, n, n + 1, random, shadows);
             light_.ask_bridges(event, n, events_, random, bridges);
-            const auto [u1, u2, u3] = random.onward(n, walk);
+            const auto [u1, u2, flown, shadow] = random.onward(n, walk);
             const Medium& medium = schedule_.onward(n);
             Turn turn{&schedule_.at(n).phase(), event.direction, u1, u2};
-            Track flight{
-                .medium = &medium, .ray = {event.position, V3f(0.0f)}, .random = walk, .first = u3};
+            Track flight{.medium = &medium,
+                         .ray = {event.position, V3f(0.0f)},
+                         .random = walk,
+                         .first = flown};
             tracker.add(turn, flight);
             do {
                 shadows.cast(tracker);
@@ -70,6 +72,7 @@ class Tracked final : public Method {
             event.direction = direction;
             event.weight *= medium.albedo();
             event.choices.add(inverse_density);
+            event.shadow = shadow;
             if (!survives(event.weight, opacity, walk)) co_return;
         }
     }

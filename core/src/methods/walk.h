@@ -26,12 +26,13 @@ Path walk_on(const Medium& medium, ScatterEvent event, int orders, const DirectL
         co_await tracked;
         kit.shadows.settle(record);
         if (order + 1 == orders) co_return;
-        const auto [u1, u2, u3] = random.onward(order, walk);
+        const auto [u1, u2, flown, shadow] = random.onward(order, walk);
         event.direction = medium.phase().sample(event.direction, u1, u2).direction;
         const LocalRay onward = medium.ray(event.position, event.direction);
-        const std::optional<NextEvent> found = next(onward, u3, walk);
+        const std::optional<NextEvent> found = next(onward, flown, walk);
         if (!found) co_return;
         event.position = found->position;
+        event.shadow = shadow;
         if (found->vacuum) {
             const float first = walk.uniform();
             Track flight{.medium = &medium,
