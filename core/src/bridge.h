@@ -43,10 +43,12 @@ class RecentChoices {
 /// events.
 class Chain {
   public:
-    Chain(const LightSample& light, const HenyeyGreenstein& phase, int length, Random random)
+    /// The directions next to the light come of `last`, two numbers each, the others of `random`.
+    Chain(const LightSample& light, const HenyeyGreenstein& phase, int length,
+          const std::array<float, 4>& last, Random random)
         : light_(light) {
-        std::array<float, longest_bridge> u1{}, u2{};
-        for (std::size_t i = 0; i < static_cast<std::size_t>(length); ++i) {
+        std::array<float, longest_bridge> u1{last[0], last[2]}, u2{last[1], last[3]};
+        for (std::size_t i = 2; i < static_cast<std::size_t>(length); ++i) {
             const auto pair = random.pair();
             u1[i] = pair[0];
             u2[i] = pair[1];

@@ -204,7 +204,7 @@ void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const P
         if (!way) continue;
         const auto inverses = way->inverses(phase, event.direction);
         // Systematic sampling (Madow 1949): one number decides on all lengths.
-        float until_taken = event_stream.uniform();
+        float until_taken = n == 0 ? random.light()[3] : event_stream.uniform();
         for (int length = 1; length <= most; ++length) {
             // Of all choices of which a bridge leaves one to be evaluated.
             const float inverse = inverses[static_cast<std::size_t>(length - 1)] +
@@ -231,8 +231,10 @@ const std::optional<Chain>& DirectLight::chain(Bridges& bridges, std::size_t lig
                                       static_cast<std::uint64_t>(n) * scene_.lights.size() + light);
         const auto [u1, u2] = stream.pair();
         const auto sample = scene_.lights[light]->sample(u1, u2);
-        chain = sample ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, stream))
-                       : std::nullopt;
+        const auto last = random.chain(n, stream);
+        chain = sample
+                    ? std::optional(Chain(*sample, schedule_.at(n).phase(), reach_, last, stream))
+                    : std::nullopt;
     }
     return chain;
 }

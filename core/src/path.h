@@ -36,11 +36,19 @@ class PathRandom {
     /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
     const Point first;
 
-    /// At the first event: the direction towards a light, and the shadow ray's first flight. Many
-    /// paths have none.
+    /// At the first event: the direction towards a light, the shadow ray's first flight, and the
+    /// choice of bridges. Many paths have none.
     const Point& light() const {
         if (!light_) light_ = stratified(light_points);
         return *light_;
+    }
+
+    /// Of a chain that events from n on share: the directions of the two events next to the light.
+    Point chain(int n, Random& stream) const {
+        if (n == 0) return stratified(chain_points);
+        const auto [u1, u2] = stream.pair();
+        const auto [u3, u4] = stream.pair();
+        return {u1, u2, u3, u4};
     }
 
     /// With what a walk goes on from event n: two numbers for the direction, one for the flight and
@@ -59,7 +67,8 @@ class PathRandom {
   private:
     // Sequences of the pixel, of which each sample has a point. Their keys lie beyond the samples'.
     static constexpr std::uint64_t camera_points = 1ULL << 32, light_points = camera_points + 1,
-                                   walk_points = camera_points + 2;
+                                   chain_points = camera_points + 2,
+                                   walk_points = camera_points + 3;
 
     Point stratified(std::uint64_t sequence) const {
         return sobol::point(sample_, hash_key(pixel_key_, sequence));
