@@ -54,7 +54,8 @@ class PathRandom {
     /// With what a walk goes on from event n: two numbers for the direction, one for the flight and
     /// one for the next event's shadow. For its first events they are stratified.
     Point onward(int n, Random& walk) const {
-        if (n < 3) return stratified(walk_points + static_cast<std::uint64_t>(n));
+        constexpr int stratified_events = 6;
+        if (n < stratified_events) return stratified(walk_points + static_cast<std::uint64_t>(n));
         const auto [u1, u2] = walk.pair();
         const auto [u3, u4] = walk.pair();
         return {u1, u2, u3, u4};
