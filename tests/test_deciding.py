@@ -18,6 +18,7 @@ from pileus_bench.scenes import SHARED, scene_names
 from pileus_service.shot import Shot
 from pileus_worker import deciding, scene
 from pileus_worker.deciding import PILOT_ORDERS, Measure, decide
+from pileus_worker.sampling import Sampler
 
 SIZE = 48
 SEEDS = range(5)
@@ -82,8 +83,8 @@ def test_the_tolerance_is_kept_by_the_smallest_model(
         assert resolved.method == method, resolved.reason
         assert (resolved.max_bounces == 1) == (volume["extinction"] < 1), resolved.reason
         view = scene.make_scene(ours, 1, field)
-        frame = deciding.render_frame(view, ours, resolved, frame=1, threads=0, control=control)
-        image = frame.pixels("beauty")[..., 0]
+        sampler = Sampler(view, ours, resolved, frame=1, threads=0, control=control)
+        image = sampler.whole().pixels("beauty")[..., 0]
         rms = math.sqrt(np.mean((image - truth) ** 2 / (truth**2 + 0.01)))
         within += rms <= tolerance
     assert within == len(SEEDS)

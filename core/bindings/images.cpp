@@ -90,7 +90,15 @@ void bind_partial_and_frame(nb::module_& m) {
             "relative_error", &Partial::relative_error,
             "The RMS relative error of its pixels for their noise, one standard error more than it "
             "seems to be.")
+        .def(
+            "pixels",
+            [](const Partial& p, const std::string& look) {
+                return rgba_of(p.image, p.image.look_index(look));
+            },
+            "look"_a, "RGBA, of shape (height, width, 4).")
         .def_prop_ro("opacity", &Partial::opacity, "The mean of 1 - transmittance.")
+        .def("pool", &Partial::pool, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
+             "Adds other samples of the same bucket. Raises InputError.")
         .def(
             "channels",
             [](const Partial& p, const std::string& look) {

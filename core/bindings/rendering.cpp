@@ -44,7 +44,7 @@ void bind_render(nb::module_& m) {
     m.def(
         "render",
         [](const Scene& scene, const Transport& transport, const BucketTuple& bucket,
-           const RangeTuple& samples, std::uint64_t seed, int frame, bool orders, int threads,
+           const RangeTuple& samples, std::uint64_t seed, int frame, int orders, int threads,
            Control* control) {
             Control own;
             const RenderTask task{to_bucket(bucket),
@@ -56,27 +56,32 @@ void bind_render(nb::module_& m) {
             return render(scene, transport, task, threads, control ? *control : own);
         },
         "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "seed"_a, "frame"_a,
-        "orders"_a = false, "threads"_a = 0, "control"_a.none() = nb::none(),
-        "Renders a bucket (x0, y0, x1, y1) over the samples [first, last). Raises InputError, "
-        "Cancelled.");
+        "orders"_a = 0, "threads"_a = 0, "control"_a.none() = nb::none(),
+        "Renders a bucket (x0, y0, x1, y1) over the samples [first, last), and keeps the images of "
+        "so "
+        "many orders; the last one holds all later ones, too. Raises InputError, Cancelled.");
 
     m.def(
-        "render_until",
-        [](const Scene& scene, const Transport& transport, const BucketTuple& bucket, int samples,
-           double tolerance, double opacity, std::uint64_t seed, int frame, bool orders,
-           int threads, Control* control) {
+        "render_parts",
+        [](const Scene& scene, const Transport& transport,
+           const std::vector<std::pair<BucketTuple, RangeTuple>>& parts, std::uint64_t seed,
+           int frame, int orders, int threads, Control* control) {
             Control own;
-            const RenderTask task{to_bucket(bucket), {0, samples}, seed, frame, orders};
+            std::vector<RenderTask> tasks;
+            for (const auto& [bucket, samples] : parts) {
+                tasks.push_back({to_bucket(bucket),
+                                 {std::get<0>(samples), std::get<1>(samples)},
+                                 seed,
+                                 frame,
+                                 orders});
+            }
             const nb::gil_scoped_release release;
-            return render_until(scene, transport, task, tolerance, opacity, threads,
-                                control ? *control : own);
+            return render(scene, transport, tasks, threads, control ? *control : own);
         },
-        "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "tolerance"_a,
-        "opacity"_a, "seed"_a, "frame"_a, "orders"_a = false, "threads"_a = 0,
-        "control"_a.none() = nb::none(),
-        "Renders a bucket until it does its share for a frame of the mean opacity `opacity` that "
-        "may have the RMS relative error `tolerance`, with at most `samples` a pixel. Raises "
-        "InputError, Cancelled.");
+        "scene"_a, "transport"_a, "parts"_a, nb::kw_only(), "seed"_a, "frame"_a, "orders"_a = 0,
+        "threads"_a = 0, "control"_a.none() = nb::none(),
+        "Renders many pairs of a bucket and samples at once, to the bits that `render` makes of "
+        "each. Raises InputError, Cancelled.");
 }
 
 }  // namespace pileus::python

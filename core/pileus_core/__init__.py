@@ -19,7 +19,7 @@ from ._core import (
     make_whitewater,
     read_image,
     render,
-    render_until,
+    render_parts,
     write_grid,
 )
 
@@ -42,6 +42,6 @@ __all__ = [
     "make_whitewater",
     "read_image",
     "render",
-    "render_until",
+    "render_parts",
     "write_grid",
 ]

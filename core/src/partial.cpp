@@ -118,6 +118,9 @@ double Partial::opacity() const {
 }
 
 void Partial::pool(const Partial& other) {
+    if (other.image.window() != image.window() || other.image.looks() != image.looks() ||
+        other.image.channels() != image.channels())
+        throw InputError("partials of different buckets, looks or orders cannot be pooled");
     const double n1 = samples.count(), n2 = other.samples.count(), n = n1 + n2;
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
         const auto mine = [&](std::size_t c) { return image.plane(look, c); };

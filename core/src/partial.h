@@ -53,6 +53,7 @@ struct Partial {
     double opacity() const;
 
     /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
+    /// Throws InputError for other buckets, looks or orders.
     void pool(const Partial& other);
 };
 

@@ -2,81 +2,19 @@
 
 #include "camera_rays.h"
 #include "error.h"
+#include "pixel_sums.h"
+#include "tiles.h"
 
-#include <tbb/blocked_range2d.h>
-#include <tbb/enumerable_thread_specific.h>
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
 #include <algorithm>
-#include <cmath>
+#include <deque>
 #include <numeric>
 
 namespace pileus {
 
 namespace {
-
-/// Sums over one pixel's samples.
-class PixelSums {
-  public:
-    PixelSums(std::size_t looks, std::size_t orders, bool keep_orders)
-        : keep_orders_(keep_orders),
-          sum_(looks, V3d(0.0)),
-          squares_(looks, V3d(0.0)),
-          order_sums_(keep_orders ? looks * orders : 0, V3d(0.0)) {}
-
-    void clear() {
-        std::fill(sum_.begin(), sum_.end(), V3d(0.0));
-        std::fill(squares_.begin(), squares_.end(), V3d(0.0));
-        std::fill(order_sums_.begin(), order_sums_.end(), V3d(0.0));
-        opacity_ = depth_ = 0.0;
-    }
-
-    void add(const PathRecord& record) {
-        for (std::size_t look = 0; look < sum_.size(); ++look) {
-            V3d radiance(record.sky);
-            for (std::size_t i = 0; i < record.orders(); ++i) {
-                const V3d layer(record.radiance(look, i));
-                radiance += layer;
-                if (keep_orders_) order_sums_[look * record.orders() + i] += layer;
-            }
-            sum_[look] += radiance;
-            squares_[look] += radiance * radiance;
-        }
-        opacity_ += record.opacity;
-        depth_ += record.opacity * record.depth;
-    }
-
-    void store(LayeredImage& image, std::size_t pixel, int count) const {
-        const double n = count;
-        for (std::size_t look = 0; look < sum_.size(); ++look) {
-            const auto set = [&](std::size_t channel, double value) {
-                image.plane(look, channel)[pixel] = storable(value);
-            };
-            for (int c = 0; c < 3; ++c) {
-                const auto channel = static_cast<std::size_t>(c);
-                const double mean = sum_[look][c] / n;
-                set(Partial::r + channel, mean);
-                const double spread = std::max(0.0, squares_[look][c] - mean * sum_[look][c]);
-                set(Partial::variance_r + channel, count > 1 ? spread / (n * (n - 1.0)) : 0.0);
-            }
-            set(Partial::a, opacity_ / n);
-            set(Partial::z, opacity_ > 0.0 ? depth_ / opacity_ : 0.0);
-            const std::size_t orders = order_sums_.size() / sum_.size();
-            for (std::size_t i = 0; i < orders; ++i) {
-                for (int c = 0; c < 3; ++c) {
-                    set(Partial::first_order + 3 * i + static_cast<std::size_t>(c),
-                        order_sums_[look * orders + i][c] / n);
-                }
-            }
-        }
-    }
-
-  private:
-    bool keep_orders_;
-    std::vector<V3d> sum_, squares_, order_sums_;
-    double opacity_ = 0.0, depth_ = 0.0;
-};
 
 /// A sample that is to be traced.
 struct Sample {
@@ -86,85 +24,204 @@ struct Sample {
     PathRandom random;
 };
 
-/// What one thread traces with.
-struct Workspace {
-    // Enough paths in flight that the tracker's lanes stay full, and few enough to lie in a cache.
-    // Fewer where an event may ask for very many looks and orders at once.
-    static constexpr std::size_t in_flight = 256;
-    // So many samples are traced before they are summed in their order: the more, the longer the
-    // lanes stay full.
-    static constexpr std::size_t gathered = 8192;
-
-    Workspace(const Scene& scene, const Transport& transport, std::size_t orders, bool keep_orders)
-        : method(make_method(scene, transport)),
-          tracker(std::make_unique<Tracker>(scene.volume->tree(), scene.medium.boxes())),
-          kits(std::clamp<std::size_t>(
-                   (std::size_t{1} << 16) /
-                       (transport.looks.size() *
-                        static_cast<std::size_t>(transport.max_bounces.value_or(1))),
-                   1, in_flight),
-               PathKit(*tracker, scene.lights.size())),
-          blank(transport.looks.size(), orders),
-          sums(transport.looks.size(), orders, keep_orders),
-          most(std::clamp<std::size_t>(
-              (std::size_t{8} << 20) / (transport.looks.size() * orders * sizeof(Color)), 16,
-              gathered)) {}
-
-    std::unique_ptr<Method> method;
-    std::unique_ptr<Tracker> tracker;
-    std::vector<PathKit> kits;  // one for each path in flight
+/// Samples in the order in which they are summed, and what their paths find.
+struct Batch {
+    std::size_t task = 0;
     std::vector<Sample> samples;
-    std::vector<PathRecord> records;  // as many as there were samples
-    PathRecord blank;
-    PixelSums sums;
-    std::size_t most;  // samples, so that their records take a few MiB
+    std::vector<PathRecord> records;  // no fewer than samples
+    std::size_t started = 0, ended = 0;
 };
 
-/// Traces the samples into their records.
-void trace(Workspace& work, const Scene& scene, const Control& control) {
-    if (work.records.size() < work.samples.size())
-        work.records.resize(work.samples.size(), work.blank);
-    std::vector<Path> paths(work.kits.size());
-    std::vector<std::size_t> idle(paths.size()), flying;
-    std::iota(idle.begin(), idle.end(), std::size_t{0});
-    std::size_t next = 0;
-    const auto start = [&] {
-        while (!idle.empty() && next < work.samples.size()) {
-            const Sample& sample = work.samples[next];
-            PathRecord& record = work.records[next++];
-            record.clear();
-            if (!sample.ray.volume) continue;
-            const std::size_t slot = idle.back();
-            paths[slot] = work.method->trace(sample.ray, sample.random, record, work.kits[slot]);
-            if (!paths[slot].resume()) continue;
-            idle.pop_back();
-            flying.push_back(slot);
+/// What all threads share.
+struct Work {
+    const Scene& scene;
+    const Transport& transport;
+    std::span<const RenderTask> tasks;
+    std::span<Partial> partials;
+    Control& control;
+    const CameraRays rays;
+    Tiles tiles;
+
+    bool keep_orders() const { return tasks.front().orders > 0; }
+    std::size_t layers() const {
+        return static_cast<std::size_t>(std::max(tasks.front().orders, 1));
+    }
+};
+
+/// The paths of one thread. As some end others start, from tile to tile, so that the tracker's
+/// lanes stay full until no tile is left.
+class Stream {
+  public:
+    explicit Stream(Work& work)
+        : work_(work),
+          method_(make_method(work.scene, work.transport)),
+          tracker_(work.scene.volume->tree(), work.scene.medium.boxes()),
+          kits_(std::clamp<std::size_t>(
+                    (std::size_t{1} << 16) /
+                        (work.transport.looks.size() *
+                         static_cast<std::size_t>(work.transport.max_bounces.value_or(1))),
+                    1, in_flight),
+                PathKit(tracker_, work.scene.lights.size())),
+          paths_(kits_.size()),
+          batch_of_(kits_.size()),
+          idle_(kits_.size()),
+          blank_(work.transport.looks.size(), work.layers()),
+          most_(std::clamp<std::size_t>((std::size_t{1} << 20) / (work.transport.looks.size() *
+                                                                  work.layers() * sizeof(Color)),
+                                        2, 1024)),
+          sums_(work.transport.looks.size(), work.layers(), work.keep_orders()) {
+        std::iota(idle_.begin(), idle_.end(), std::size_t{0});
+    }
+
+    void run() {
+        start();
+        while (!flying_.empty()) {
+            if (work_.control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
+            tracker_.run();
+            go_on();
+            // Many at once, so that camera rays, too, fill the lanes.
+            if (4 * idle_.size() >= paths_.size()) start();
         }
-    };
-    do {
-        if (control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
-        // Many at once, so that camera rays, too, fill the lanes.
-        if (4 * idle.size() >= paths.size()) start();
-        work.tracker->run();
-        auto kept = flying.begin();
-        for (const std::size_t slot : flying) {
-            if (paths[slot].resume()) {
+        settle();
+    }
+
+  private:
+    // Enough paths that the lanes stay full, and few enough to lie in a cache. Fewer where an event
+    // may ask for very many looks and orders at once.
+    static constexpr std::size_t in_flight = 256;
+    // A batch waits for its longest path, and no more than so many batches wait.
+    static constexpr std::size_t most_batches = 8;
+
+    void start() {
+        while (!idle_.empty()) {
+            if ((batches_.empty() || batches_.back().started == batches_.back().samples.size()) &&
+                !gather())
+                return;
+            Batch& batch = batches_.back();
+            const Sample& sample = batch.samples[batch.started];
+            PathRecord& record = batch.records[batch.started++];
+            record.clear();
+            if (sample.ray.volume) {
+                const std::size_t slot = idle_.back();
+                paths_[slot] = method_->trace(sample.ray, sample.random, record, kits_[slot]);
+                if (paths_[slot].resume()) {
+                    batch_of_[slot] = &batch;
+                    idle_.pop_back();
+                    flying_.push_back(slot);
+                    continue;
+                }
+            }
+            ++batch.ended;
+        }
+    }
+
+    void go_on() {
+        auto kept = flying_.begin();
+        for (const std::size_t slot : flying_) {
+            if (paths_[slot].resume()) {
                 *kept++ = slot;
             } else {
-                idle.push_back(slot);
+                ++batch_of_[slot]->ended;
+                idle_.push_back(slot);
             }
         }
-        flying.erase(kept, flying.end());
-    } while (!flying.empty() || next < work.samples.size());
-    if (!scene.background) return;
-    for (std::size_t i = 0; i < work.samples.size(); ++i) {
-        PathRecord& record = work.records[i];
-        if (record.opacity < 1.0f)
-            record.sky = scene.sky(work.samples[i].ray.direction) * (1.0f - record.opacity);
+        flying_.erase(kept, flying_.end());
     }
-}
 
-void check(const Scene& scene, const Transport& transport, const RenderTask& task) {
+    /// Begins another batch of the tile, or of the next one.
+    bool gather() {
+        settle();
+        if (batches_.size() == most_batches) return false;
+        if (!tile_) {
+            tile_ = work_.tiles.take();
+            if (!tile_) return false;
+            x_ = tile_->area.x0;
+            y_ = tile_->area.y0;
+            sample_ = work_.tasks[tile_->task].samples.first;
+        }
+        Batch batch;
+        if (!spare_.empty()) {
+            batch = std::move(spare_.back());
+            spare_.pop_back();
+        }
+        batch.task = tile_->task;
+        fill(batch);
+        if (batch.records.size() < batch.samples.size())
+            batch.records.resize(batch.samples.size(), blank_);
+        batches_.push_back(std::move(batch));
+        return true;
+    }
+
+    /// The next samples of the tile.
+    void fill(Batch& batch) {
+        const RenderTask& task = work_.tasks[batch.task];
+        const Bucket& bucket = task.bucket;
+        const std::uint64_t frame_key =
+            hash_key(hash_key(0, task.seed), static_cast<std::uint64_t>(task.frame));
+        for (; y_ < tile_->area.y1; ++y_, x_ = tile_->area.x0) {
+            const std::uint64_t row_key = hash_key(frame_key, static_cast<std::uint64_t>(y_));
+            for (; x_ < tile_->area.x1; ++x_, sample_ = task.samples.first) {
+                const std::uint64_t pixel_key = hash_key(row_key, static_cast<std::uint64_t>(x_));
+                const auto pixel = static_cast<std::size_t>(y_ - bucket.y0) *
+                                       static_cast<std::size_t>(bucket.width()) +
+                                   static_cast<std::size_t>(x_ - bucket.x0);
+                for (; sample_ < task.samples.last; ++sample_) {
+                    if (batch.samples.size() == most_) return;
+                    const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample_));
+                    batch.samples.push_back({pixel, sample_ + 1 == task.samples.last,
+                                             work_.rays.through(x_ + double{random.first[0]},
+                                                                y_ + double{random.first[1]}),
+                                             random});
+                }
+            }
+        }
+        tile_.reset();
+    }
+
+    /// Sums the batches that have ended, the earlier ones first.
+    void settle() {
+        while (!batches_.empty() && batches_.front().ended == batches_.front().samples.size()) {
+            Batch batch = std::move(batches_.front());
+            batches_.pop_front();
+            Partial& partial = work_.partials[batch.task];
+            const int count = work_.tasks[batch.task].samples.count();
+            for (std::size_t i = 0; i < batch.samples.size(); ++i) {
+                const Sample& sample = batch.samples[i];
+                PathRecord& record = batch.records[i];
+                if (work_.scene.background && record.opacity < 1.0f) {
+                    record.sky = work_.scene.sky(sample.ray.direction) * (1.0f - record.opacity);
+                }
+                if (record.bounded) std::atomic_ref(partial.bounded_paths).fetch_add(1);
+                sums_.add(record);
+                if (!sample.last) continue;
+                sums_.store(partial.image, sample.pixel, count);
+                sums_.clear();
+                work_.control.samples_done.fetch_add(count, std::memory_order_relaxed);
+            }
+            batch.samples.clear();
+            batch.started = batch.ended = 0;
+            spare_.push_back(std::move(batch));
+        }
+    }
+
+    Work& work_;
+    std::unique_ptr<Method> method_;
+    Tracker tracker_;
+    std::vector<PathKit> kits_;  // one for each path in flight
+    std::vector<Path> paths_;
+    std::vector<Batch*> batch_of_;  // of a path that flies
+    std::vector<std::size_t> idle_, flying_;
+    std::deque<Batch> batches_;  // stay where they are as others come and go
+    std::vector<Batch> spare_;
+    PathRecord blank_;
+    std::size_t most_;  // samples of a batch, so that its records take at most a MiB
+    PixelSums sums_;
+    // The tile that is being gathered, and where.
+    std::optional<Tile> tile_;
+    int x_ = 0, y_ = 0, sample_ = 0;
+};
+
+void check(const Scene& scene, const RenderTask& task, int orders) {
     const Bucket& b = task.bucket;
     if (b.x0 < 0 || b.y0 < 0 || b.x1 > scene.width || b.y1 > scene.height || b.width() < 1 ||
         b.height() < 1) {
@@ -172,110 +229,37 @@ void check(const Scene& scene, const Transport& transport, const RenderTask& tas
     }
     if (task.samples.first < 0 || task.samples.count() < 1)
         throw InputError("the sample range is empty");
-    if (task.orders && !transport.max_bounces) {
-        throw InputError(
-            "image.orders needs a bounded number of orders; set transport.max_bounces");
-    }
+    if (task.orders != orders || orders < 0)
+        throw InputError("all tasks keep equally many orders, at least 0");
 }
 
 }  // namespace
 
-Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
-               Control& control) {
-    check(scene, transport, task);
-    const std::size_t orders = task.orders ? static_cast<std::size_t>(*transport.max_bounces) : 1;
+std::vector<Partial> render(const Scene& scene, const Transport& transport,
+                            std::span<const RenderTask> tasks, int threads, Control& control) {
+    if (tasks.empty()) return {};
     std::vector<std::string> looks;
     for (const Look& look : transport.looks) looks.push_back(look.name);
-
-    Partial partial;
-    partial.width = scene.width;
-    partial.height = scene.height;
-    partial.samples = task.samples;
-    partial.image = LayeredImage(task.bucket, looks, channel_names(task.orders ? orders : 0));
-
-    const CameraRays rays(scene);
-    const std::uint64_t frame_key =
-        hash_key(hash_key(0, task.seed), static_cast<std::uint64_t>(task.frame));
-    std::atomic<std::int64_t> bounded{0};
-    tbb::enumerable_thread_specific<Workspace> workspaces(
-        [&] { return Workspace(scene, transport, orders, task.orders); });
-
-    // Traces what a thread has gathered.
-    const auto settle = [&](Workspace& work) {
-        trace(work, scene, control);
-        for (std::size_t i = 0; i < work.samples.size(); ++i) {
-            const Sample& sample = work.samples[i];
-            if (work.records[i].bounded) bounded.fetch_add(1, std::memory_order_relaxed);
-            work.sums.add(work.records[i]);
-            if (!sample.last) continue;
-            work.sums.store(partial.image, sample.pixel, task.samples.count());
-            work.sums.clear();
-            control.samples_done.fetch_add(task.samples.count(), std::memory_order_relaxed);
-        }
-        work.samples.clear();
-    };
-
-    const auto gather_pixel = [&](Workspace& work, int x, int y) {
-        const std::uint64_t pixel_key = hash_key(hash_key(frame_key, static_cast<std::uint64_t>(y)),
-                                                 static_cast<std::uint64_t>(x));
-        const auto pixel = static_cast<std::size_t>(y - task.bucket.y0) *
-                               static_cast<std::size_t>(task.bucket.width()) +
-                           static_cast<std::size_t>(x - task.bucket.x0);
-        for (int sample = task.samples.first; sample < task.samples.last; ++sample) {
-            const PathRandom random(pixel_key, static_cast<std::uint32_t>(sample));
-            work.samples.push_back(
-                {pixel, sample + 1 == task.samples.last,
-                 rays.through(x + double{random.first[0]}, y + double{random.first[1]}), random});
-            if (work.samples.size() == work.most) settle(work);
-        }
-    };
-
-    // Tiles of enough samples to be traced together.
-    const int side = std::clamp(
-        static_cast<int>(std::sqrt(double{Workspace::gathered} / task.samples.count())), 4, 32);
-    using Tiles = tbb::blocked_range2d<int>;
+    std::vector<Partial> partials;
+    for (const RenderTask& task : tasks) {
+        check(scene, task, tasks.front().orders);
+        Partial& partial = partials.emplace_back();
+        partial.width = scene.width;
+        partial.height = scene.height;
+        partial.samples = task.samples;
+        partial.image =
+            LayeredImage(task.bucket, looks, channel_names(static_cast<std::size_t>(task.orders)));
+    }
+    Work work{scene, transport, tasks, partials, control, CameraRays(scene), Tiles(tasks)};
     tbb::task_arena arena(threads > 0 ? threads : tbb::task_arena::automatic);
     arena.execute([&] {
-        const Tiles tiles(task.bucket.y0, task.bucket.y1, static_cast<std::size_t>(side),
-                          task.bucket.x0, task.bucket.x1, static_cast<std::size_t>(side));
-        tbb::parallel_for(tiles, [&](const Tiles& tile) {
-            Workspace& work = workspaces.local();
-            for (int y = tile.rows().begin(); y != tile.rows().end(); ++y) {
-                for (int x = tile.cols().begin(); x != tile.cols().end(); ++x)
-                    gather_pixel(work, x, y);
-            }
-            settle(work);
-        });
+        const auto streams =
+            std::min(static_cast<std::size_t>(arena.max_concurrency()), work.tiles.count());
+        tbb::parallel_for(
+            std::size_t{0}, streams, [&](std::size_t) { Stream(work).run(); },
+            tbb::simple_partitioner());
     });
-    partial.bounded_paths = bounded;
-    return partial;
-}
-
-Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
-                     double tolerance, double opacity, int threads, Control& control) {
-    // What is shared out evenly, for noise that has nothing to do with opacity, as of a sky's
-    // texture at the pixels' edges; where there is none, the frame's error is so much smaller.
-    constexpr double even = 0.1;
-    if (!(tolerance > 0.0)) throw InputError("the tolerance must be positive");
-    if (!(opacity > 0.0)) throw InputError("the frame's opacity must be positive");
-    RenderTask round = task;
-    round.samples = {0, 1};
-    Partial partial = render(scene, transport, round, threads, control);
-    while (partial.samples.last < task.samples.last) {
-        const int taken = partial.samples.last;
-        const double share = even + (1.0 - even) * partial.opacity() / opacity;
-        const double error = partial.relative_error() / tolerance;
-        // Few samples have met few of the rare bright paths and make too little of them: n count
-        // as n / (1 + 1 / n).
-        const double needed = error * error / share * taken;
-        const double wanted = std::ceil((needed + std::sqrt(needed * (needed + 4.0))) / 2.0);
-        if (!(wanted > taken)) break;
-        // From a round that is too short to know, not too far.
-        const double next = std::min({wanted, 4.0 * taken, double(task.samples.last)});
-        round.samples = {taken, static_cast<int>(next)};
-        partial.pool(render(scene, transport, round, threads, control));
-    }
-    return partial;
+    return partials;
 }
 
 }  // namespace pileus

@@ -6,6 +6,8 @@
 
 #include <atomic>
 #include <cstdint>
+#include <span>
+#include <vector>
 
 namespace pileus {
 
@@ -25,21 +27,18 @@ struct RenderTask {
     SampleRange samples;
     std::uint64_t seed;
     int frame;
-    bool orders;  // whether to keep each order's image; needs a bounded number of them
+    int orders;  // how many orders' images to keep; the last one holds all later orders, too
 };
 
-/// Renders a task with `threads` threads (0: all there are). Each pixel's samples depend on (seed,
-/// frame, pixel, sample index) alone. Throws InputError for a task that does not fit the scene,
-/// Cancelled.
-Partial render(const Scene& scene, const Transport& transport, const RenderTask& task, int threads,
-               Control& control);
+/// Renders tasks of one frame with `threads` threads (0: all there are); they keep equally many
+/// orders. Each pixel's samples depend on (seed, frame, pixel, sample index) alone. Throws
+/// InputError for a task that does not fit the scene, Cancelled.
+std::vector<Partial> render(const Scene& scene, const Transport& transport,
+                            std::span<const RenderTask> tasks, int threads, Control& control);
 
-/// Renders the task in rounds until the bucket does its share for a frame that may have the RMS
-/// relative error `tolerance` and has the mean opacity `opacity`, or all of the task's samples are
-/// taken. A bucket may err by as much of it as it has of the opacity: where there is only sky there
-/// is no noise, and the rest may have more. Samples begin at 0; the partial says how many there
-/// are, and they are those that `render` takes.
-Partial render_until(const Scene& scene, const Transport& transport, const RenderTask& task,
-                     double tolerance, double opacity, int threads, Control& control);
+inline Partial render(const Scene& scene, const Transport& transport, const RenderTask& task,
+                      int threads, Control& control) {
+    return std::move(render(scene, transport, {&task, 1}, threads, control).front());
+}
 
 }  // namespace pileus

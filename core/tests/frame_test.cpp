@@ -254,7 +254,8 @@ TEST(Pool, EqualsOneRange) {
         test::transport_of("multiple", 3, {{"hero"}, {"low", 0.5f, 0.5f, 0.5f}});
     Control control;
     const auto range = [&](int first, int last) {
-        return render(scene, transport, {{0, 0, 16, 16}, {first, last}, 5, 1, true}, 0, control);
+        return render(scene, transport,
+                      {{0, 0, 16, 16}, {first, last}, 5, 1, *transport.max_bounces}, 0, control);
     };
     const Partial whole = range(0, 64);
     for (const auto& cuts : {std::vector<int>{0, 32, 64}, std::vector<int>{0, 1, 2, 3, 5, 64},

@@ -4,7 +4,9 @@
 #include "error.h"
 #include "support.h"
 
+#include <array>
 #include <gtest/gtest.h>
+#include <numeric>
 #include <vector>
 
 namespace pileus {
@@ -25,7 +27,8 @@ Scene make_rough_scene(bool background = true) {
 Partial render_bucket(const Scene& scene, const Transport& transport, const Bucket& bucket,
                       const SampleRange& samples, bool orders = false, int threads = 0) {
     Control control;
-    return render(scene, transport, {bucket, samples, 21, 3, orders}, threads, control);
+    return render(scene, transport, {bucket, samples, 21, 3, orders ? *transport.max_bounces : 0},
+                  threads, control);
 }
 
 constexpr Bucket whole{0, 0, width, height};
@@ -145,7 +148,7 @@ TEST_P(MethodTest, SeedFrameAndPixelChangeTheNoise) {
     const Scene scene = make_rough_scene();
     Control control;
     const auto keyed = [&](std::uint64_t seed, int frame) {
-        return render(scene, transport(), {whole, {0, 4}, seed, frame, false}, 0, control);
+        return render(scene, transport(), {whole, {0, 4}, seed, frame, 0}, 0, control);
     };
     const auto first = keyed(1, 1).image.data();
     EXPECT_EQ(first, keyed(1, 1).image.data());
@@ -208,17 +211,70 @@ TEST(Render, RefusesTasksThatDoNotFit) {
     EXPECT_THROW(attempt({4, 4, 4, 8}, {0, 1}), InputError);
     EXPECT_THROW(attempt(whole, {0, 0}), InputError);
     EXPECT_THROW(attempt(whole, {-1, 1}), InputError);
-    EXPECT_THROW(render_bucket(scene, test::transport_of("reference"), whole, {0, 1}, true),
-                 InputError);
+    Control control;
+    const std::array unlike{RenderTask{whole, {0, 1}, 1, 1, 0}, RenderTask{whole, {0, 1}, 1, 1, 1}};
+    EXPECT_THROW(render(scene, transport, unlike, 0, control), InputError);
+    EXPECT_THROW(render(scene, transport, {whole, {0, 1}, 1, 1, -1}, 0, control), InputError);
+}
+
+TEST(Render, TasksTogetherAreThoseRenderedAlone) {
+    // Some of more samples than are gathered at once, in one pixel or in many.
+    const Scene scene = make_rough_scene();
+    const Transport transport = test::transport_of("reference");
+    const std::vector<RenderTask> tasks{{whole, {0, 2}, 1, 1, 0},
+                                        {{5, 4, 7, 5}, {3, 5003}, 1, 1, 0},
+                                        {whole, {7, 50}, 2, 1, 0},
+                                        {{8, 6, 9, 7}, {0, 1}, 1, 2, 0}};
+    std::vector<std::vector<float>> alone;
+    Control control;
+    for (const RenderTask& task : tasks)
+        alone.push_back(look_of(render(scene, transport, task, 1, control), 0));
+    for (const int threads : {1, 2, 5}) {
+        control.samples_done = 0;
+        const std::vector<Partial> together = render(scene, transport, tasks, threads, control);
+        std::int64_t samples = 0;
+        for (std::size_t i = 0; i < tasks.size(); ++i) {
+            EXPECT_EQ(look_of(together[i], 0), alone[i]) << i;
+            EXPECT_EQ(together[i].samples, tasks[i].samples);
+            samples += std::int64_t{tasks[i].samples.count()} *
+                       static_cast<std::int64_t>(tasks[i].bucket.pixels());
+        }
+        EXPECT_EQ(control.samples_done, samples);
+    }
+}
+
+TEST(Render, TheLastOrderHoldsAllLaterOnes) {
+    const Scene scene = make_rough_scene(false);
+    Control control;
+    const auto orders_of = [&](int orders) {
+        const Partial partial = render(scene, test::transport_of("reference"),
+                                       {whole, {0, 8}, 1, 1, orders}, 0, control);
+        std::vector<double> sums;
+        for (std::size_t c = 0; c < partial.image.channels().size(); ++c) {
+            const float* const plane = partial.image.plane(0, c);
+            sums.push_back(std::accumulate(plane, plane + whole.pixels(), 0.0));
+        }
+        return sums;
+    };
+    const std::vector<double> few = orders_of(2), many = orders_of(12);
+    constexpr std::size_t first = Partial::first_order;
+    for (std::size_t c = 0; c < 3; ++c) {
+        EXPECT_EQ(few[first + c], many[first + c]);
+        double later = 0.0;
+        for (std::size_t i = 1; i < 12; ++i) later += many[first + 3 * i + c];
+        EXPECT_NEAR(few[first + 3 + c], later, 1e-5 * later);
+        EXPECT_GT(many[first + 33 + c], 0.0);
+        EXPECT_NEAR(few[c], few[first + c] + later, 1e-5 * few[c]);
+    }
 }
 
 TEST(Render, EndsWhenCancelled) {
     const Scene scene = make_rough_scene();
     Control control;
     control.cancelled = true;
-    EXPECT_THROW(render(scene, test::transport_of("multiple"), {whole, {0, 1000000}, 1, 1, false},
-                        0, control),
-                 Cancelled);
+    EXPECT_THROW(
+        render(scene, test::transport_of("multiple"), {whole, {0, 1000000}, 1, 1, 0}, 0, control),
+        Cancelled);
 }
 
 }  // namespace

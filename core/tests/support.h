@@ -205,8 +205,12 @@ inline Partial render_whole(const Scene& scene, const Transport& transport, int 
                             bool orders = false, int threads = 0) {
     Control control;
     return render(scene, transport,
-                  {{0, 0, scene.width, scene.height}, {0, samples}, 11, 1, orders}, threads,
-                  control);
+                  {{0, 0, scene.width, scene.height},
+                   {0, samples},
+                   11,
+                   1,
+                   orders ? *transport.max_bounces : 0},
+                  threads, control);
 }
 
 }  // namespace pileus::test

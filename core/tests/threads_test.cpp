@@ -30,7 +30,7 @@ TEST_P(ThreadsTest, BucketsOfOneSceneRenderedAtOnceAreThoseOfOneRender) {
     Control control;
     const auto part = [&](int n) {
         const Bucket rows{0, n * height / threads, width, (n + 1) * height / threads};
-        return render(scene, transport, {rows, {0, 4}, 11, 1, false}, 1, control);
+        return render(scene, transport, {rows, {0, 4}, 11, 1, 0}, 1, control);
     };
     std::vector<Partial> parts(threads);
     {

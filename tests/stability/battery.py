@@ -22,6 +22,7 @@ from pileus_service.shot import (
     Volume,
 )
 from pileus_worker import deciding, scene
+from pileus_worker.sampling import Sampler
 from stability.hazards import BEAUTY, HALVES, PHYSICAL, Hazard, Light
 
 Pixels = NDArray[np.floating[Any]]
@@ -114,16 +115,9 @@ class Stage:
         volume = volume or self.volume
         control = core.Control()
         resolved = deciding.resolve(shot, 1, lambda: volume, threads=threads, control=control)
-        return deciding.render(
-            scene.make_scene(shot, 1, volume),
-            shot,
-            resolved,
-            frame=1,
-            bucket=(0, 0, *self.size),
-            samples=samples,
-            threads=threads,
-            control=control,
-        )
+        view = scene.make_scene(shot, 1, volume)
+        sampler = Sampler(view, shot, resolved, frame=1, threads=threads, control=control)
+        return sampler.parts([(0, 0, *self.size)], samples)[0]
 
     def shot(
         self,

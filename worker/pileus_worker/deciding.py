@@ -7,16 +7,16 @@ so every machine decides alike.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import pileus_core as core
 from numpy.typing import NDArray
 
-from pileus_service.jobs import Bucket, Resolved
+from pileus_service.jobs import Resolved
 from pileus_service.shot import Shot
-from pileus_worker import planning, scene
+from pileus_worker import scene
 
 PILOT_PIXELS = 1024
 FEWEST_PIXELS = 128
@@ -30,7 +30,7 @@ SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
 Planes = NDArray[np.float32]
-_ORDERS = [f"order{order:02d}." for order in range(PILOT_ORDERS)]
+_ORDERS = [f"order{order:02d}." for order in range(PILOT_ORDERS + 1)]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
 
@@ -44,80 +44,6 @@ class Measure:
     tail: NDArray[np.float64]
     opacity: float = 1.0
     noise: float = math.inf
-
-
-def render(
-    view: core.Scene,
-    shot: Shot,
-    resolved: Resolved,
-    *,
-    frame: int,
-    bucket: Bucket,
-    samples: tuple[int, int],
-    threads: int,
-    control: core.Control,
-) -> core.Partial:
-    """A part of a frame as it was decided: all of its samples, or from 0 as many as its error
-    wants."""
-    transport = scene.make_transport(shot, resolved)
-    seed, orders = shot.sampling.seed, shot.image.orders
-    if resolved.noise is None:
-        return core.render(
-            view,
-            transport,
-            bucket=bucket,
-            samples=samples,
-            seed=seed,
-            frame=frame,
-            orders=orders,
-            threads=threads,
-            control=control,
-        )
-    return core.render_until(
-        view,
-        transport,
-        bucket=bucket,
-        samples=samples[1],
-        tolerance=resolved.noise,
-        opacity=resolved.opacity,
-        seed=seed,
-        frame=frame,
-        orders=orders,
-        threads=threads,
-        control=control,
-    )
-
-
-def render_frame(
-    view: core.Scene,
-    shot: Shot,
-    resolved: Resolved,
-    *,
-    frame: int,
-    threads: int,
-    control: core.Control,
-    done: Callable[[int], None] = lambda pixels: None,
-) -> core.Frame:
-    """All of a frame as it was decided; `done` hears of the pixels that are finished."""
-    size = (shot.image.width, shot.image.height)
-    samples, adaptive = shot.sampling.samples, resolved.noise is not None
-    buckets = planning.tiles(*size, planning.ADAPTIVE_EDGE if adaptive else max(size))
-    whole = core.Frame(*size, [(each, None if adaptive else samples) for each in buckets])
-    for bucket in buckets:
-        whole.add(
-            render(
-                view,
-                shot,
-                resolved,
-                frame=frame,
-                bucket=bucket,
-                samples=(0, samples),
-                threads=threads,
-                control=control,
-            )
-        )
-        done((bucket[2] - bucket[0]) * (bucket[3] - bucket[1]))
-    return whole
 
 
 def resolve(
@@ -181,46 +107,37 @@ class Pilot:
         self._scene = scene.make_scene(small, frame, volume, reading)
 
     def opacity(self) -> float:
-        return _opacity(self._halves(1))
+        return _opacity(self._halves((0, 1)))
 
     def measure(self) -> Measure:
-        """After a first look of one sample, with as many as the frame's noise is worth."""
+        """From as many samples as the noise of the first one is worth."""
         sampling = self._shot.sampling
         assert sampling.tolerance is not None  # the shot's own check
-        layered = self._halves(1, PILOT_ORDERS)
-        noise = [half.relative_error() for half in layered]
+        halves = self._halves((0, 1))
+        noise = [half.relative_error() for half in halves]
         wanted = min((max(noise) / sampling.tolerance) ** 2, sampling.samples)
         samples = int(min(max(1.0, self._share * wanted), PILOT_SAMPLES))
         if samples > 1:
-            layered = self._halves(samples, PILOT_ORDERS)
-        layers = np.stack([_planes(half, [*_ORDERS, ""]) for half in layered])
-        images, cut_off = layers[:, :, -1].copy(), 0
-        layers[:, :, -1] = 0.0  # what comes after the last order
-        # Deep in a closed medium no order of these brings light, and all of it comes later.
-        if layers[:, :, PILOT_ORDERS // 2 :].any() or not layers.any():
-            whole = self._halves(samples)
-            layers[:, :, -1] = [_planes(half, [""])[:, 0] for half in whole] - images
-            images += layers[:, :, -1]
-            cut_off = sum(half.bounded_paths for half in whole)
-        tails = [_tail(layers[:, look], images[:, look]) for look in range(layers.shape[1])]
-        if cut_off:
+            for half, further in zip(halves, self._halves((1, samples)), strict=True):
+                half.pool(further)
+        layers = np.stack([_planes(half) for half in halves])
+        tails = [_tail(layers[:, look]) for look in range(layers.shape[1])]
+        if any(half.bounded_paths for half in halves):
             tails.append(np.ones(PILOT_ORDERS + 1))  # of what was cut off nothing is known
-        return Measure(np.max(tails, axis=0), _opacity(layered), sum(noise) / 2)
+        return Measure(np.max(tails, axis=0), _opacity(halves), sum(noise) / 2)
 
-    def _halves(self, samples: int, orders: int | None = None) -> tuple[core.Partial, core.Partial]:
-        """With every order of scattering, or some of them each for itself, on the same paths."""
+    def _halves(self, samples: tuple[int, int]) -> tuple[core.Partial, core.Partial]:
+        """With each order of scattering for itself, and what comes after the last one."""
 
         def half(number: int) -> core.Partial:
             return core.render(
                 self._scene,
-                core.Transport(
-                    method="similarity", max_bounces=orders, looks=scene.make_looks(self._shot)
-                ),
+                core.Transport(method="similarity", looks=scene.make_looks(self._shot)),
                 bucket=(0, 0, *self._size),
-                samples=(0, samples),
+                samples=samples,
                 seed=self._shot.sampling.seed + number,
                 frame=self._frame,
-                orders=orders is not None,
+                orders=PILOT_ORDERS + 1,
                 threads=self._threads,
                 control=self._control,
             )
@@ -233,21 +150,22 @@ def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
     return max(0.001, sum(half.opacity for half in halves) / 2)
 
 
-def _planes(half: core.Partial, layers: Sequence[str]) -> Planes:
-    """The named layers, of shape (looks, layers, 3, rows, columns)."""
+def _planes(half: core.Partial) -> Planes:
+    """The orders and the whole, of shape (looks, orders + 1, 3, rows, columns)."""
     looks = [half.channels(look) for look in half.looks]
+    layers = [*_ORDERS, ""]
     return np.array([[[look[layer + c] for c in "RGB"] for layer in layers] for look in looks])
 
 
-def _tail(layers: Planes, images: Planes) -> NDArray[np.float64]:
+def _tail(layers: Planes) -> NDArray[np.float64]:
     """What the orders from N on bring, N = 0 .. 32, from two halves, in blocks of pixels; and two
     standard errors more. Few paths may all end early; but light falls from order to order ever more
     slowly, so none is taken to leave less than the first two let expect."""
-    rests = np.cumsum(_blocks(layers)[:, ::-1], axis=1)[:, ::-1]
-    level = _blocks(images).mean(axis=(0, 1))
+    blocks = _blocks(layers)
+    rests = np.cumsum(blocks[:, -2::-1], axis=1)[:, ::-1]
+    level = blocks[:, -1].mean(axis=(0, 1))
     products = np.mean(rests[0] * rests[1], axis=1) / (level**2 + 0.01)
-    blocks = (1, 2)
-    upper = products.mean(blocks) + 2 * products.std(blocks) / math.sqrt(level.size)
+    upper = products.mean((1, 2)) + 2 * products.std((1, 2)) / math.sqrt(level.size)
     falling = np.maximum(np.maximum.accumulate(upper[::-1])[::-1], 0.0)
     if falling[2] > 0:
         further = np.arange(len(falling) - 2)

@@ -34,6 +34,7 @@ from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.paths import PathMap
 from pileus_worker.pictures import write_preview
+from pileus_worker.sampling import Sampler
 
 # A cache that nobody has written to for so long is whole.
 SETTLED_SECONDS = 60.0
@@ -329,16 +330,15 @@ class Work:
         self, view: core.Scene, plan: Plan, bucket: Bucket, samples: tuple[int, int]
     ) -> core.Partial:
         with self._phase("render"):
-            return deciding.render(
+            sampler = Sampler(
                 view,
                 self.job.shot,
                 plan.transport,
                 frame=self.frame,
-                bucket=bucket,
-                samples=samples,
                 threads=self.threads,
                 control=self.control,
             )
+            return sampler.parts([bucket], samples)[0]
 
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:

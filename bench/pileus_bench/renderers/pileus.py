@@ -8,6 +8,7 @@ from pileus_bench.renderers.protocol import Image, serve
 from pileus_service.shot import Shot
 from pileus_worker import deciding, machine, scene
 from pileus_worker.denoising import denoise
+from pileus_worker.sampling import Sampler
 
 
 class Pileus:
@@ -36,9 +37,9 @@ class Pileus:
         self.resolved = deciding.resolve(
             shot, self._frame, lambda: self._volume, threads=threads, control=control
         )
-        frame = deciding.render_frame(
+        frame = Sampler(
             self._scene, shot, self.resolved, frame=self._frame, threads=threads, control=control
-        )
+        ).whole()
         self.samples = frame.mean_samples
         denoise(frame, shot, threads or machine.cores())
         return frame.pixels(shot.transport.looks[0].name)[..., :3]

@@ -21,6 +21,7 @@ from pileus_worker import deciding, machine, scene
 from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
 from pileus_worker.errors import plain_errors
+from pileus_worker.sampling import Sampler
 
 app = typer.Typer()
 
@@ -76,7 +77,7 @@ class Renderer:
         if index + 1 < len(self._frames):
             self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
         rendering = time.monotonic()
-        resolved, frame = self._watched(index, number, volume)
+        resolved, frame, unmet = self._watched(index, number, volume)
         render_seconds = time.monotonic() - rendering
         denoise(frame, shot, self._threads)
         output = shot.output(number)
@@ -89,12 +90,12 @@ class Renderer:
             self._display.note(
                 f"frame {number}: {frame.bounded_paths} paths met the bound on work and were ended"
             )
-        error, noise = frame.relative_error(), resolved.noise
-        if noise is not None and error > 1.1 * noise:
+        if unmet:
             self._display.note(
-                f"frame {number}: warning: noise of {error:.2%} is over the {noise:.2%} that the "
-                "tolerance leaves it; raise sampling.samples"
+                f"frame {number}: warning: {unmet} buckets have taken all {shot.sampling.samples} "
+                "samples and are not within the tolerance; raise sampling.samples"
             )
+        error = frame.relative_error()
         return {
             "frame": number,
             "file": str(output),
@@ -109,8 +110,11 @@ class Renderer:
             "bounded_paths": frame.bounded_paths,
         }
 
-    def _watched(self, index: int, number: int, volume: core.Volume) -> tuple[Resolved, core.Frame]:
-        """Renders with progress; a Ctrl-C stops the renderer's threads too."""
+    def _watched(
+        self, index: int, number: int, volume: core.Volume
+    ) -> tuple[Resolved, core.Frame, int]:
+        """Renders with progress, and says how many buckets miss the tolerance; a Ctrl-C stops the
+        renderer's threads too."""
         control = core.Control()
         with ThreadPoolExecutor(1) as executor:
             future = executor.submit(self._render, number, volume, control)
@@ -126,7 +130,7 @@ class Renderer:
 
     def _render(
         self, number: int, volume: core.Volume, control: core.Control
-    ) -> tuple[Resolved, core.Frame]:
+    ) -> tuple[Resolved, core.Frame, int]:
         shot = self._shot
         self._pixels_done = 0
         resolved = deciding.resolve(
@@ -138,16 +142,16 @@ class Renderer:
             earlier=self._first,
         )
         self._first = self._first or resolved
-        frame = deciding.render_frame(
+        sampler = Sampler(
             scene.make_scene(shot, number, volume),
             shot,
             resolved,
             frame=number,
             threads=self._threads,
             control=control,
-            done=self._count,
         )
-        return resolved, frame
+        frame = sampler.whole(self._count)
+        return resolved, frame, sampler.unmet
 
     def _count(self, pixels: int) -> None:
         self._pixels_done += pixels
