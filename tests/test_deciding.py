@@ -91,12 +91,15 @@ def test_the_tolerance_is_kept_by_the_smallest_model(
 
 
 @pytest.mark.slow
-def test_the_promise_holds_on_the_charts_scenes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("denoise", [False, True])
+def test_the_promise_holds_on_the_charts_scenes(tmp_path: Path, denoise: bool) -> None:
     """As `python -m pileus_bench.promise` prints it: five seeds, in 95 % of renders."""
     asked = argparse.Namespace(
         scenes=",".join(scene_names()), scale=0.5, data=tmp_path, shared=SHARED
     )
-    settings = promise.AUTO | {"tolerance": 0.05}
+    if denoise:
+        pytest.importorskip("pyoidn")
+    settings = promise.AUTO | {"tolerance": 0.05, "denoise": denoise}
     held = [
         error(renderer.timed(settings, promise.MOST_SAMPLES, seed)[0], truth) <= 0.05**2
         for _, renderer, truth in ready(asked)

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pileus_service.shot import Shot
+from pileus_worker import scene
 from pileus_worker.denoising import Filter, Quality, guide_of
 
 pytest.importorskip("pyoidn", reason="Open Image Denoise has no wheel for this machine")
@@ -90,8 +91,8 @@ def test_images_of_any_shape_are_denoised(
     [
         ({"samples": 4}, "FAST"),
         ({"samples": 5}, "HIGH"),
-        ({"samples": 5, "tolerance": 0.2}, "FAST"),
-        ({"samples": 5, "tolerance": 0.19}, "HIGH"),
+        ({"samples": 8, "tolerance": 0.04}, "FAST"),
+        ({"samples": 8, "tolerance": 0.039}, "HIGH"),
     ],
 )
 def test_the_fast_network_is_taken_where_the_shot_asks_for_little(
@@ -105,6 +106,41 @@ def test_the_fast_network_is_taken_where_the_shot_asks_for_little(
     by_quality = {each: Filter(2)(images, each) for each in get_args(Quality)}
     np.testing.assert_array_equal(own, by_quality[quality])
     assert not np.array_equal(by_quality["FAST"], by_quality["HIGH"])
+
+
+def test_the_tolerance_is_that_of_the_denoised_image(noisy: Shot, tmp_path: Path) -> None:
+    """It is met with fewer samples than the rendered image would take, on each look."""
+    sampling = {"samples": 4096, "tolerance": 0.06}
+    shot = changed(changed(noisy, "image", orders=False), "sampling", **sampling)
+    plain = changed(shot, "image", denoise=False)
+    truth = rendered(changed(plain, "sampling", samples=2048, tolerance=None), tmp_path / "t.exr")
+    for seed in (1, 2, 3):
+        own = rendered(changed(shot, "sampling", seed=seed), tmp_path / "denoised.exr")
+        more = rendered(changed(plain, "sampling", seed=seed), tmp_path / "plain.exr")
+        for look, channels in own.items():
+            assert rel_mse(channels, truth[look]) <= 0.06**2, look
+            assert rel_mse(channels, truth[look], "noisy.") > 2 * rel_mse(more[look], truth[look])
+
+
+def test_partials_serve_with_a_filter_and_without_unless_it_sets_their_samples(
+    noisy: Shot,
+) -> None:
+    def identities(shot: Shot) -> set[str]:
+        both = [changed(shot, "image", denoise=denoise) for denoise in (False, True)]
+        return {scene.identity(each, 1, []) for each in both}
+
+    assert len(identities(noisy)) == 1
+    assert len(identities(changed(noisy, "sampling", tolerance=0.1))) == 2
+
+
+@pytest.mark.parametrize("samples", [1, 5])
+def test_samples_that_run_out_are_told(noisy: Shot, tmp_path: Path, samples: int) -> None:
+    shot = changed(noisy, "sampling", samples=samples, tolerance=1e-3)
+    file = tmp_path / "shot.json"
+    file.write_text(changed(shot, "image", output=str(tmp_path / "a.exr")).model_dump_json())
+    ended = subprocess.run([PILEUS, "render", str(file)], capture_output=True, text=True)
+    assert ended.returncode == 0
+    assert f"have taken all {samples} samples and are not within the tolerance" in ended.stderr
 
 
 def test_the_guide_spreads_the_opacity_and_keeps_its_mean() -> None:

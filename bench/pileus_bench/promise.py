@@ -1,10 +1,11 @@
 """Does `auto` keep its promise, and what does that cost?
 
-    python -m pileus_bench.promise [--tolerance 0.05] [--scenes A,B] [--data DIR]
+    python -m pileus_bench.promise [--tolerance 0.05] [--denoise] [--scenes A,B] [--data DIR]
 
 On each scene `auto` renders with five seeds. The error against the truth must stay within the
 tolerance; the cost is set against the best fixed choice: of all methods and sample counts the
-cheapest that keeps the same promise with the same seeds, as one would find it by trying.
+cheapest that keeps the same promise with the same seeds, as one would find it by trying. With
+`--denoise` only `auto` is denoised.
 """
 
 import math
@@ -103,16 +104,19 @@ class Outcome:
         return self.seconds / self.fixed_seconds
 
 
-def measure(name: str, renderer: Here, truth: Truth, tolerance: float) -> Outcome | None:
+def measure(
+    name: str, renderer: Here, truth: Truth, tolerance: float, denoise: bool
+) -> Outcome | None:
     """Prints the scene's row."""
     found = best(renderer, truth, tolerance)
     if found is None:
         print(f"| {name} | no fixed choice keeps the tolerance |")
         return None
     fixed, samples = found
+    wanted = AUTO | {"tolerance": tolerance, "denoise": denoise}
     seen, ours, theirs, counts = [], [], [], []
     for seed in SEEDS:
-        image, spent = renderer.timed(AUTO | {"tolerance": tolerance}, MOST_SAMPLES, seed)
+        image, spent = renderer.timed(wanted, MOST_SAMPLES, seed)
         seen.append(math.sqrt(max(0.0, error(image, truth))))
         ours.append(spent.cpu_seconds)
         counts.append(renderer.samples)
@@ -144,13 +148,14 @@ def summary(outcomes: Sequence[Outcome], tolerance: float) -> str:
 def main() -> None:
     options = parser("Tries the promise of `auto`.")
     options.add_argument("--tolerance", type=float, default=0.05)
+    options.add_argument("--denoise", action="store_true", help="what `auto` renders")
     asked = options.parse_args()
     head = ["scene", "`auto`: method, samples", "errors of five seeds, %", "core s"]
     head += ["best fixed choice", "core s", "ratio"]
     print(f"| {' | '.join(head)} |\n{'|---' * len(head)}|")
     outcomes = []
     for name, renderer, truth in ready(asked):
-        found = measure(name, renderer, truth, asked.tolerance)
+        found = measure(name, renderer, truth, asked.tolerance, asked.denoise)
         if found is not None:
             outcomes.append(found)
     if outcomes:

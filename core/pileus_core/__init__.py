@@ -20,6 +20,7 @@ from ._core import (
     read_image,
     render,
     render_parts,
+    smoothed_error,
     write_grid,
 )
 
@@ -43,5 +44,6 @@ __all__ = [
     "read_image",
     "render",
     "render_parts",
+    "smoothed_error",
     "write_grid",
 ]

@@ -117,10 +117,15 @@ double Partial::opacity() const {
     return std::accumulate(alpha, alpha + pixels, 0.0) / static_cast<double>(pixels);
 }
 
-void Partial::pool(const Partial& other) {
+void Partial::check_alike(const Partial& other) const {
     if (other.image.window() != image.window() || other.image.looks() != image.looks() ||
-        other.image.channels() != image.channels())
+        other.image.channels() != image.channels()) {
         throw InputError("partials of different buckets, looks or orders cannot be pooled");
+    }
+}
+
+void Partial::pool(const Partial& other) {
+    check_alike(other);
     const double n1 = samples.count(), n2 = other.samples.count(), n = n1 + n2;
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
         const auto mine = [&](std::size_t c) { return image.plane(look, c); };
@@ -147,8 +152,8 @@ void Partial::pool(const Partial& other) {
             for (std::size_t c = first_order; c < image.channels().size(); ++c) mean(c);
         }
     }
-    samples = {std::min(samples.first, other.samples.first),
-               std::max(samples.last, other.samples.last)};
+    const int first = std::min(samples.first, other.samples.first);
+    samples = {first, first + samples.count() + other.samples.count()};
     bounded_paths += other.bounded_paths;
 }
 

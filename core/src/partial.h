@@ -53,8 +53,17 @@ struct Partial {
     double opacity() const;
 
     /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
-    /// Throws InputError for other buckets, looks or orders.
+    /// The range then has as many samples as both. Throws as `check_alike` does.
     void pool(const Partial& other);
+
+    /// Throws InputError for other buckets, looks or orders.
+    void check_alike(const Partial& other) const;
 };
+
+/// The RMS relative error of two independent halves of a bucket's samples together, once each pixel
+/// is the mean over a square of 3x3 to 9x9 pixels about it, whichever serves best; of the look
+/// where it is greatest, and one standard error more. Infinite where there are too few pixels to
+/// know. Throws as `check_alike` does.
+double smoothed_error(const Partial& half, const Partial& other);
 
 }  // namespace pileus

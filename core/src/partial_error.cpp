@@ -1,10 +1,10 @@
 // How far a partial's pixels are from what more samples would make of them.
+#include "block_mean.h"
 #include "partial.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <limits>
 #include <optional>
 
 namespace pileus {
@@ -56,28 +56,6 @@ struct Pixels {
 
     const float* values;
     int width, height;
-};
-
-/// A mean over blocks and how sure it is.
-class BlockMean {
-  public:
-    void add(double value) {
-        sum_ += value;
-        squares_ += value * value;
-        ++count_;
-    }
-
-    /// One standard error above the mean: where rare bright paths make the noise, few blocks tell
-    /// of it. Infinite where there is none.
-    double upper() const {
-        if (count_ == 0) return std::numeric_limits<double>::infinity();
-        const double mean = sum_ / count_;
-        return mean + std::sqrt(std::max(0.0, squares_ / count_ - mean * mean) / count_);
-    }
-
-  private:
-    double sum_ = 0.0, squares_ = 0.0;
-    int count_ = 0;
 };
 
 }  // namespace

@@ -223,7 +223,7 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         noise=math.sqrt(tolerance**2 - (cut + bias) ** 2),
         opacity=measure.opacity,
         reason=f"{reach}, which leaves out {cut:.1%}{without}; {why}, "
-        f"for the tolerance {tolerance:.1%}",
+        f"for the tolerance {tolerance:.1%}{' once denoised' if shot.image.denoise else ''}",
     )
 
 

@@ -23,6 +23,10 @@ EVEN = 0.1
 GROWTH = 4
 # The buckets whose rounds go together, for threads wait for each other after each.
 TOGETHER = 64
+# What a smoothed image errs by falls more slowly than noise does: as the inverse of this power of
+# the samples or a greater one.
+SMOOTHED_POWER = 0.7
+Halves = tuple[core.Partial, ...]  # one or two
 
 
 class Sampler:
@@ -58,48 +62,71 @@ class Sampler:
         return frame
 
     def parts(self, buckets: Sequence[Bucket], samples: tuple[int, int]) -> list[core.Partial]:
-        """The buckets with all of the samples, or from 0 on with as many as their error wants."""
+        """The buckets with all of the samples, or from 0 on with as many as their error wants.
+
+        What is to be denoised grows as two independent halves: they tell what smoothing leaves of
+        its error, and a denoiser does no worse."""
         if self._resolved.noise is None:
             return self._render([(bucket, samples) for bucket in buckets])
-        parts = self._render([(bucket, (0, 1)) for bucket in buckets])
-        pending = self._pending(parts, samples[1])
+        count = 2 if self._shot.image.denoise and samples[1] > 1 else 1
+        most = samples[1] // count
+        first = [(bucket, (0, 1)) for bucket in buckets]
+        growing = list(zip(*(self._render(first, half) for half in range(count)), strict=True))
+        pending = self._pending(growing, most)
         while pending:
-            ranges = [(part.bucket, (part.samples[1], wanted)) for part, wanted in pending]
-            for (part, _), more in zip(pending, self._render(ranges), strict=True):
-                part.pool(more)
-            pending = self._pending([part for part, _ in pending], samples[1])
-        return parts
+            ranges = [(halves[0].bucket, (_taken(halves), wanted)) for halves, wanted in pending]
+            for half in range(count):
+                for (halves, _), more in zip(pending, self._render(ranges, half), strict=True):
+                    halves[half].pool(more)
+            pending = self._pending([halves for halves, _ in pending], most)
+        for whole, *rest in growing:
+            for half in rest:
+                whole.pool(half)
+        return [halves[0] for halves in growing]
 
-    def _pending(self, parts: Sequence[core.Partial], most: int) -> list[tuple[core.Partial, int]]:
+    def _pending(self, growing: Sequence[Halves], most: int) -> list[tuple[Halves, int]]:
         """Those that want more samples and may have them, and how many in all."""
         pending = []
-        for part in parts:
-            taken, wanted = part.samples[1], self._wanted(part)
-            if wanted > taken == most:
+        for halves in growing:
+            wanted = self._wanted(halves)
+            if wanted > _taken(halves) == most:
                 self.unmet += 1
-            elif wanted > taken:
-                pending.append((part, min(wanted, most)))
+            elif wanted > _taken(halves):
+                pending.append((halves, min(wanted, most)))
         return pending
 
-    def _wanted(self, part: core.Partial) -> int:
-        """The samples that a part should have in all; no more than it has where those suffice."""
+    def _wanted(self, halves: Halves) -> int:
+        """The samples that each should have, in all; no more than they have where those suffice."""
         assert self._resolved.noise is not None
-        taken = part.samples[1]
-        share = EVEN + (1 - EVEN) * part.opacity / self._resolved.opacity
-        needed = (part.relative_error() / self._resolved.noise) ** 2 / share * taken
+        taken = _taken(halves)
+        opacity = sum(half.opacity for half in halves) / len(halves)
+        share = EVEN + (1 - EVEN) * opacity / self._resolved.opacity
+        allowed = self._resolved.noise**2 * share
+        error = max(half.relative_error() for half in halves) ** 2 / len(halves)
+        needed = error / allowed * taken
         # Few samples have met few of the rare bright paths and make too little of them: n count as
         # n / (1 + 1 / n).
         wanted = (needed + math.sqrt(needed * (needed + 4))) / 2
+        if len(halves) == 2 and wanted > taken:
+            error = core.smoothed_error(*halves) ** 2
+            wanted = min(wanted, taken * (error / allowed) ** (1 / SMOOTHED_POWER))
         return math.ceil(min(wanted, GROWTH * taken))
 
-    def _render(self, parts: list[tuple[Bucket, tuple[int, int]]]) -> list[core.Partial]:
+    def _render(
+        self, parts: list[tuple[Bucket, tuple[int, int]]], half: int = 0
+    ) -> list[core.Partial]:
         return core.render_parts(
             self._view,
             self._transport,
             parts,
-            seed=self._shot.sampling.seed,
+            # No shot has a seed of so many bits.
+            seed=self._shot.sampling.seed + (half << 32),
             frame=self._frame,
             orders=self._orders,
             threads=self._threads,
             control=self._control,
         )
+
+
+def _taken(halves: Halves) -> int:
+    return halves[0].samples[1]

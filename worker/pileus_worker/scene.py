@@ -101,11 +101,14 @@ def make_transport(shot: Shot, resolved: Resolved) -> core.Transport:
 
 def identity(shot: Shot, frame: int, files: Sequence[Cache]) -> str:
     """A digest of all that a frame's pixels depend on; partials of another are no part of it."""
+    unseen = {"output", "pixel_type"}
+    if shot.sampling.tolerance is None:
+        unseen.add("denoise")  # which else says how many samples are taken
     pixels = {
         "frame": frame,
         "files": [file.model_dump() for file in files],
         "camera": shot.camera.at(frame).model_dump(),
-        "image": shot.image.model_dump(exclude={"output", "pixel_type", "denoise"}),
+        "image": shot.image.model_dump(exclude=unseen),
         "version": core.__version__,
         **shot.model_dump(mode="json", include={"volumes", "lights", "transport", "sampling"}),
     }

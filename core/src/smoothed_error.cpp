@@ -1,0 +1,146 @@
+// How far a bucket is from the truth when it is smoothed: what a denoiser, which does no worse, can
+// be trusted with.
+#include "block_mean.h"
+#include "partial.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+namespace pileus {
+
+namespace {
+
+using Means = std::vector<double>;  // by pixel
+
+/// Means over the squares of 2 r + 1 pixels' side about each pixel, cut off at the bucket's edges.
+Means means_of(const float* plane, const Bucket& window, int r) {
+    const int width = window.width(), height = window.height();
+    // Sums over all that lies above and to the left.
+    const auto at = [&](int x, int y) { return static_cast<std::size_t>(y * (width + 1) + x); };
+    std::vector<double> sums(at(0, height + 1), 0.0);
+    for (int y = 0; y < height; ++y) {
+        for (int x = 0; x < width; ++x) {
+            sums[at(x + 1, y + 1)] = double{plane[y * width + x]} + sums[at(x, y + 1)] +
+                                     sums[at(x + 1, y)] - sums[at(x, y)];
+        }
+    }
+    Means means;
+    means.reserve(window.pixels());
+    for (int y = 0; y < height; ++y) {
+        const int y0 = std::max(0, y - r), y1 = std::min(height, y + r + 1);
+        for (int x = 0; x < width; ++x) {
+            const int x0 = std::max(0, x - r), x1 = std::min(width, x + r + 1);
+            const double sum =
+                sums[at(x1, y1)] - sums[at(x0, y1)] - sums[at(x1, y0)] + sums[at(x0, y0)];
+            means.push_back(sum / ((x1 - x0) * (y1 - y0)));
+        }
+    }
+    return means;
+}
+
+/// One channel of two independent halves of a bucket's samples, A and B, smoothed over squares and
+/// over the next smaller ones, of which the smallest are pixels.
+struct Smoothed {
+    Smoothed(const float* a, const float* b, const Bucket& window, int r)
+        : wide_a(means_of(a, window, r)),
+          wide_b(means_of(b, window, r)),
+          near_a(means_of(a, window, r - 1)),
+          near_b(means_of(b, window, r - 1)) {
+        const auto spread = [](int radius) { return (2 * radius + 1) * (2 * radius + 1) - 1.0; };
+        const double ratio = spread(r) / (spread(r) - spread(r - 1));
+        curvature = ratio * ratio;
+    }
+
+    /// Of the mean of both halves, an estimate of the variance that the squares leave.
+    double variance(std::size_t pixel) const {
+        const double apart = wide_a[pixel] - wide_b[pixel];
+        return apart * apart / 4.0;
+    }
+
+    /// An estimate of the squared bias of the squares: of what they differ by from the next smaller
+    /// ones, of the other half so that noise does not meet itself. (The pixels of the smaller ones
+    /// are also in the larger, which takes twice their variance off again.) Where an image is
+    /// curved the bias of a mean grows as the variance of its square's pixels, side^2 - 1, and so
+    /// it is in proportion to that difference.
+    double squared_bias(std::size_t pixel) const {
+        const double apart = wide_a[pixel] - wide_b[pixel];
+        const double shift = (wide_a[pixel] - near_b[pixel]) * (wide_b[pixel] - near_a[pixel]);
+        return curvature * (shift + apart * apart);
+    }
+
+    double level(std::size_t pixel) const { return (near_a[pixel] + near_b[pixel]) / 2.0; }
+
+    Means wide_a, wide_b, near_a, near_b;
+    double curvature;
+};
+
+constexpr int block = 8;  // what smoothing leaves of noise is alike from pixel to pixel
+constexpr int fewest_blocks = 8;
+
+/// What squares leave, relative to the image: means over whole blocks and channels.
+struct Left {
+    Left(const std::array<Smoothed, 3>& channels, const Bucket& window) {
+        for (int y0 = 0; y0 + block <= window.height(); y0 += block) {
+            for (int x0 = 0; x0 + block <= window.width(); x0 += block)
+                add(channels, window, x0, y0);
+        }
+    }
+
+    void add(const std::array<Smoothed, 3>& channels, const Bucket& window, int x0, int y0) {
+        double block_variance = 0.0, block_bias = 0.0;
+        for (const Smoothed& channel : channels) {
+            double level = 0.0, variances = 0.0, biases = 0.0;
+            for (int y = y0; y < y0 + block; ++y) {
+                for (int x = x0; x < x0 + block; ++x) {
+                    const auto pixel = static_cast<std::size_t>(y * window.width() + x);
+                    level += channel.level(pixel) / (block * block);
+                    variances += channel.variance(pixel) / (block * block);
+                    biases += channel.squared_bias(pixel) / (block * block);
+                }
+            }
+            const double scale = 1.0 / (level * level + 0.01) / 3.0;
+            block_variance += scale * variances;
+            block_bias += scale * biases;
+        }
+        variance.add(block_variance);
+        squared_bias.add(block_bias);
+        squared_error.add(block_variance + block_bias);
+    }
+
+    BlockMean variance, squared_bias, squared_error;
+};
+
+}  // namespace
+
+double smoothed_error(const Partial& half, const Partial& other) {
+    half.check_alike(other);
+    const Bucket& window = half.image.window();
+    if ((window.width() / block) * (window.height() / block) < fewest_blocks)
+        return std::numeric_limits<double>::infinity();
+    double greatest = 0.0;
+    for (std::size_t look = 0; look < half.image.looks().size(); ++look) {
+        const auto left_by = [&](int radius) {
+            const auto smoothed = [&](std::size_t channel) {
+                return Smoothed(half.image.plane(look, channel), other.image.plane(look, channel),
+                                window, radius);
+            };
+            return Left({smoothed(Partial::r), smoothed(Partial::g), smoothed(Partial::b)}, window);
+        };
+        const Left finest = left_by(1);
+        double least = finest.squared_error.upper();
+        for (const int radius : {2, 3, 4}) {
+            const Left left = left_by(radius);
+            // Detail as fine as pixels is lost on the larger squares and the next smaller ones
+            // alike.
+            least = std::min(least, std::max(left.squared_error.upper(),
+                                             left.variance.mean() + finest.squared_bias.mean()));
+        }
+        greatest = std::max(greatest, least);
+    }
+    return std::sqrt(greatest);
+}
+
+}  // namespace pileus
