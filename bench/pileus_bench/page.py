@@ -63,7 +63,7 @@ def write_page(chart: Chart, page: Path, picture: str) -> None:
             + [["mean", *(_number(_over_scenes(chart.points, scenes, n)) for n in names)]],
         ),
         f"## Core seconds to a relMSE of {TARGET:g}\n\n"
-        "Bias included; a dash where it alone is more.\n",
+        "Bias included, and at least a sample a pixel; a dash where the bias alone is more.\n",
         _table(
             ["", *names],
             [
