@@ -91,6 +91,20 @@ void bind_partial_and_frame(nb::module_& m) {
             "The RMS relative error of its pixels for their noise, one standard error more than it "
             "seems to be.")
         .def(
+            "orders",
+            [](const Partial& p, const std::string& look) {
+                const LayeredImage& image = p.image;
+                const Bucket& window = image.window();
+                const std::size_t planes = image.channels().size() - Partial::first_order;
+                const float* const first =
+                    planes > 0 ? image.plane(image.look_index(look), Partial::first_order)
+                               : nullptr;
+                return to_array({first, first + planes * window.pixels()},
+                                {planes / 3, 3, static_cast<std::size_t>(window.height()),
+                                 static_cast<std::size_t>(window.width())});
+            },
+            "look"_a, "Of shape (orders, 3, height, width).")
+        .def(
             "pixels",
             [](const Partial& p, const std::string& look) {
                 return rgba_of(p.image, p.image.look_index(look));

@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <limits>
 #include <string>
+#include <vector>
 
 namespace pileus {
 
@@ -35,6 +36,9 @@ struct Partial {
     LayeredImage image;  // means over the samples; of one sample, the variance is told as 0
     std::int64_t bounded_paths = 0;
     std::string identity;  // of the frame it belongs to: partials of different ones never mix
+    // By look, R, G, B and pixel: what the means of the two ranges pooled last differ by, as an
+    // estimate of the variance of the mean of both. Not part of a file.
+    std::vector<float> apart;
 
     /// Whole or not at all. The header carries a digest of everything. Throws std::runtime_error.
     void write(const std::string& path) const;
@@ -45,8 +49,9 @@ struct Partial {
     /// The RMS relative error of its pixels for their noise, of the look where it is greatest: the
     /// root of the mean over pixels and RGB of variance / (mean^2 + 0.01), plus one standard error.
     /// The variance is told by each pixel's samples, which know nothing of their stratification,
-    /// and by how unlike its neighbours a pixel is, which takes detail for noise: both err upwards,
-    /// and the smaller counts. Infinite for one sample of fewer than 3x3 pixels.
+    /// by how unlike its neighbours a pixel is, which takes detail for noise, and by how far two
+    /// ranges of samples lay apart, each less stratified than both: all err upwards, and the least
+    /// counts. Infinite for one sample of fewer than 3x3 pixels.
     double relative_error() const;
 
     /// The mean over pixels of 1 - transmittance.

@@ -63,7 +63,7 @@ struct Pixels {
 double Partial::relative_error() const {
     double greatest = 0.0;
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
-        BlockMean by_samples, by_neighbours;
+        BlockMean by_samples, by_neighbours, by_ranges;
         for (std::size_t c = 0; c < 3; ++c) {
             const Pixels mean{image.plane(look, r + c), image.window()};
             const Pixels variance{image.plane(look, variance_r + c), image.window()};
@@ -75,10 +75,16 @@ double Partial::relative_error() const {
                         by_samples.add(scale * *variance.over_block(x, y, &Pixels::at));
                     if (const auto ripple = mean.over_block(x, y, &Pixels::ripple))
                         by_neighbours.add(scale * *ripple);
+                    if (!apart.empty()) {
+                        const Pixels ranges{apart.data() + (look * 3 + c) * image.window().pixels(),
+                                            image.window()};
+                        by_ranges.add(scale * *ranges.over_block(x, y, &Pixels::at));
+                    }
                 }
             }
         }
-        greatest = std::max(greatest, std::min(by_samples.upper(), by_neighbours.upper()));
+        greatest = std::max(
+            greatest, std::min({by_samples.upper(), by_neighbours.upper(), by_ranges.upper()}));
     }
     return std::sqrt(greatest);
 }

@@ -52,9 +52,10 @@ std::string refusal(const std::function<void()>& action) {
 
 /// A bucket of one look whose every pixel is `level` and noise of so much variance, which its
 /// samples take for `told`; `detail` is added to and taken from the pixels by turns.
-Partial noisy(double level, double variance, double told, double detail = 0.0) {
+Partial noisy(double level, double variance, double told, double detail = 0.0,
+              std::uint64_t seed = 7) {
     Partial partial = make_partial({0, 0, width, height}, {0, 4}, "shot", {"beauty"});
-    Random random(7);
+    Random random(seed);
     for (std::size_t c = 0; c < 3; ++c) {
         for (std::size_t i = 0; i < partial.image.window().pixels(); ++i) {
             // Uniform, of variance 1.
@@ -68,7 +69,7 @@ Partial noisy(double level, double variance, double told, double detail = 0.0) {
     return partial;
 }
 
-TEST(Partial, TellsItsErrorBySamplesOrNeighboursWhicheverSaysLess) {
+TEST(Partial, TellsItsErrorBySamplesNeighboursOrRangesWhicheverSaysLeast) {
     const double level = 2.0, variance = 0.01;
     const double exact = std::sqrt(variance / (level * level + 0.01));
     // Samples that know nothing of their stratification say too much, and so does detail. One
@@ -77,6 +78,10 @@ TEST(Partial, TellsItsErrorBySamplesOrNeighboursWhicheverSaysLess) {
     EXPECT_NEAR(noisy(level, variance, 9 * variance).relative_error(), exact, 0.15 * exact);
     EXPECT_NEAR(noisy(level, variance, variance, 0.5).relative_error(), exact, 0.05 * exact);
     EXPECT_GT(noisy(level, variance, 9 * variance, 0.5).relative_error(), 2 * exact);
+    // Detail is common to two ranges, and what they differ by knows of their stratification.
+    Partial pooled = noisy(level, 2 * variance, 18 * variance, 0.5);
+    pooled.pool(noisy(level, 2 * variance, 18 * variance, 0.5, 8));
+    EXPECT_NEAR(pooled.relative_error(), exact, 0.15 * exact);
 }
 
 TEST(Partial, OfOneSampleTellsItsErrorByNeighboursAlone) {

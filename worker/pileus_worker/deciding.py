@@ -30,7 +30,6 @@ SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
 Planes = NDArray[np.float32]
-_ORDERS = [f"order{order:02d}." for order in range(PILOT_ORDERS + 1)]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
 
@@ -152,9 +151,9 @@ def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
 
 def _planes(half: core.Partial) -> Planes:
     """The orders and the whole, of shape (looks, orders + 1, 3, rows, columns)."""
-    looks = [half.channels(look) for look in half.looks]
-    layers = [*_ORDERS, ""]
-    return np.array([[[look[layer + c] for c in "RGB"] for layer in layers] for look in looks])
+    wholes = [np.moveaxis(half.pixels(look)[..., :3], -1, 0) for look in half.looks]
+    orders = [half.orders(look) for look in half.looks]
+    return np.concatenate([orders, np.expand_dims(wholes, 1)], axis=1)
 
 
 def _tail(layers: Planes) -> NDArray[np.float64]:
