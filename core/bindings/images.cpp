@@ -111,8 +111,10 @@ void bind_partial_and_frame(nb::module_& m) {
             },
             "look"_a, "RGBA, of shape (height, width, 4).")
         .def_prop_ro("opacity", &Partial::opacity, "The mean of 1 - transmittance.")
-        .def("pool", &Partial::pool, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
-             "Adds other samples of the same bucket. Raises InputError.")
+        .def("pool", &Partial::pool_comparing, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
+             "Adds other samples of the same bucket; `relative_error` then knows what the two "
+             "differ "
+             "by. Raises InputError.")
         .def(
             "channels",
             [](const Partial& p, const std::string& look) {

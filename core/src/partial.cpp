@@ -124,11 +124,29 @@ void Partial::check_alike(const Partial& other) const {
     }
 }
 
-void Partial::pool(const Partial& other) {
+void Partial::pool_comparing(const Partial& other) {
     check_alike(other);
     const double n1 = samples.count(), n2 = other.samples.count(), n = n1 + n2;
     const std::size_t pixels = image.window().pixels();
     apart.resize(image.looks().size() * 3 * pixels);
+    for (std::size_t look = 0; look < image.looks().size(); ++look) {
+        for (std::size_t c = 0; c < 3; ++c) {
+            const float* const mine = image.plane(look, r + c);
+            const float* const theirs = other.image.plane(look, r + c);
+            float* const into = apart.data() + (look * 3 + c) * pixels;
+            for (std::size_t pixel = 0; pixel < pixels; ++pixel) {
+                const double gap = double{theirs[pixel]} - mine[pixel];
+                into[pixel] = storable(gap * gap * n1 * n2 / (n * n));
+            }
+        }
+    }
+    pool(other);
+}
+
+void Partial::pool(const Partial& other) {
+    check_alike(other);
+    const double n1 = samples.count(), n2 = other.samples.count(), n = n1 + n2;
+    const std::size_t pixels = image.window().pixels();
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
         const auto mine = [&](std::size_t c) { return image.plane(look, c); };
         const auto theirs = [&](std::size_t c) { return other.image.plane(look, c); };
@@ -149,7 +167,6 @@ void Partial::pool(const Partial& other) {
                                        theirs(variance_r + c)[pixel] * n2 * (n2 - 1.0) +
                                        gap * gap * n1 * n2 / n;
                 mine(variance_r + c)[pixel] = storable(squares / (n * (n - 1.0)));
-                apart[(look * 3 + c) * pixels + pixel] = storable(gap * gap * n1 * n2 / (n * n));
             }
             for (std::size_t c = r; c <= a; ++c) mean(c);
             for (std::size_t c = first_order; c < image.channels().size(); ++c) mean(c);

@@ -36,8 +36,7 @@ struct Partial {
     LayeredImage image;  // means over the samples; of one sample, the variance is told as 0
     std::int64_t bounded_paths = 0;
     std::string identity;  // of the frame it belongs to: partials of different ones never mix
-    // By look, R, G, B and pixel: what the means of the two ranges pooled last differ by, as an
-    // estimate of the variance of the mean of both. Not part of a file.
+    // Of `pool_comparing`, by look, R, G, B and pixel; not part of a file.
     std::vector<float> apart;
 
     /// Whole or not at all. The header carries a digest of everything. Throws std::runtime_error.
@@ -60,6 +59,9 @@ struct Partial {
     /// Adds other samples of the same bucket; variances are pooled (Chan, Golub & LeVeque 1979).
     /// The range then has as many samples as both. Throws as `check_alike` does.
     void pool(const Partial& other);
+
+    /// The same, and keeps what the two differ by, as an estimate of the variance of their mean.
+    void pool_comparing(const Partial& other);
 
     /// Throws InputError for other buckets, looks or orders.
     void check_alike(const Partial& other) const;

@@ -80,7 +80,7 @@ TEST(Partial, TellsItsErrorBySamplesNeighboursOrRangesWhicheverSaysLeast) {
     EXPECT_GT(noisy(level, variance, 9 * variance, 0.5).relative_error(), 2 * exact);
     // Detail is common to two ranges, and what they differ by knows of their stratification.
     Partial pooled = noisy(level, 2 * variance, 18 * variance, 0.5);
-    pooled.pool(noisy(level, 2 * variance, 18 * variance, 0.5, 8));
+    pooled.pool_comparing(noisy(level, 2 * variance, 18 * variance, 0.5, 8));
     EXPECT_NEAR(pooled.relative_error(), exact, 0.15 * exact);
 }
 
