@@ -1,3 +1,5 @@
+// Renders tasks: each thread keeps many paths in flight, takes tile after tile, and sums samples in
+// their order.
 #include "render.h"
 
 #include "camera_rays.h"
