@@ -69,7 +69,7 @@ def _auto(points: Sequence[Point], name: str) -> Bar:
     for p in points:
         if (p.contender, p.budget) != (name, TARGET**0.5) or p.trimmed.value > TARGET:
             continue
-        theirs = [s for name in rivals if (s := seconds_to(points, p.scene, name, TARGET))]
+        theirs = [s for rival in rivals if (s := seconds_to(points, p.scene, rival, TARGET))]
         if theirs:
             ratios[p.scene] = min(theirs) / p.cpu_seconds
     return Bar(
@@ -115,7 +115,10 @@ def _multiple_to_target(points: Sequence[Point]) -> Bar:
         return _no_less_than_a_sample(wanted, points, scene, name)
 
     return _against_single(
-        points, f"the same to a noise of {TARGET:g}, with a sample a pixel or more", to_target
+        points,
+        f"multiple at 16 orders against single, time to a noise of {TARGET:g}, a sample a pixel or "
+        "more",
+        to_target,
     )
 
 

@@ -112,9 +112,8 @@ void bind_partial_and_frame(nb::module_& m) {
             "look"_a, "RGBA, of shape (height, width, 4).")
         .def_prop_ro("opacity", &Partial::opacity, "The mean of 1 - transmittance.")
         .def("pool", &Partial::pool_comparing, "other"_a, nb::call_guard<nb::gil_scoped_release>(),
-             "Adds other samples of the same bucket; `relative_error` then knows what the two "
-             "differ "
-             "by. Raises InputError.")
+             "Adds other samples of the same bucket, and keeps what the two differ by for "
+             "`relative_error`. Raises InputError.")
         .def(
             "channels",
             [](const Partial& p, const std::string& look) {

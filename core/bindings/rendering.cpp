@@ -4,6 +4,12 @@
 
 namespace pileus::python {
 
+namespace {
+
+SampleRange to_range(const RangeTuple& t) { return {std::get<0>(t), std::get<1>(t)}; }
+
+}  // namespace
+
 void bind_look(nb::module_& m) {
     nb::class_<Look>(m, "Look", "The artist's a, b and c, each in [0, 1].")
         .def(
@@ -47,19 +53,14 @@ void bind_render(nb::module_& m) {
            const RangeTuple& samples, std::uint64_t seed, int frame, int orders, int threads,
            Control* control) {
             Control own;
-            const RenderTask task{to_bucket(bucket),
-                                  {std::get<0>(samples), std::get<1>(samples)},
-                                  seed,
-                                  frame,
-                                  orders};
+            const RenderTask task{to_bucket(bucket), to_range(samples), seed, frame, orders};
             const nb::gil_scoped_release release;
             return render(scene, transport, task, threads, control ? *control : own);
         },
         "scene"_a, "transport"_a, nb::kw_only(), "bucket"_a, "samples"_a, "seed"_a, "frame"_a,
         "orders"_a = 0, "threads"_a = 0, "control"_a.none() = nb::none(),
-        "Renders a bucket (x0, y0, x1, y1) over the samples [first, last), and keeps the images of "
-        "so "
-        "many orders; the last one holds all later ones, too. Raises InputError, Cancelled.");
+        "Renders a bucket (x0, y0, x1, y1) over the samples [first, last). It keeps the images of "
+        "so many orders; the last one holds all later ones, too. Raises InputError, Cancelled.");
 
     m.def(
         "render_parts",
@@ -68,13 +69,8 @@ void bind_render(nb::module_& m) {
            int frame, int orders, int threads, Control* control) {
             Control own;
             std::vector<RenderTask> tasks;
-            for (const auto& [bucket, samples] : parts) {
-                tasks.push_back({to_bucket(bucket),
-                                 {std::get<0>(samples), std::get<1>(samples)},
-                                 seed,
-                                 frame,
-                                 orders});
-            }
+            for (const auto& [bucket, samples] : parts)
+                tasks.push_back({to_bucket(bucket), to_range(samples), seed, frame, orders});
             const nb::gil_scoped_release release;
             return render(scene, transport, tasks, threads, control ? *control : own);
         },

@@ -120,7 +120,7 @@ double Partial::opacity() const {
 void Partial::check_alike(const Partial& other) const {
     if (other.image.window() != image.window() || other.image.looks() != image.looks() ||
         other.image.channels() != image.channels()) {
-        throw InputError("partials of different buckets, looks or orders cannot be pooled");
+        throw InputError("the partials are of different buckets, looks or orders");
     }
 }
 

@@ -1,5 +1,5 @@
-// How far a bucket is from the truth when it is smoothed: what a denoiser, which does no worse, can
-// be trusted with.
+// How far a bucket is from the truth when it is smoothed: what a denoiser, of which no less may be
+// expected, can be trusted with.
 #include "block_mean.h"
 #include "partial.h"
 
@@ -41,55 +41,59 @@ Means means_of(const float* plane, const Bucket& window, int r) {
     return means;
 }
 
-/// One channel of two independent halves of a bucket's samples, A and B, smoothed over squares and
-/// over the next smaller ones, of which the smallest are pixels.
+constexpr int largest = 4;  // radius of a square
+
+/// One channel of two independent halves of a bucket's samples, A and B, smoothed over squares, by
+/// radius; those of radius 0 are the pixels.
 struct Smoothed {
-    Smoothed(const float* a, const float* b, const Bucket& window, int r)
-        : wide_a(means_of(a, window, r)),
-          wide_b(means_of(b, window, r)),
-          near_a(means_of(a, window, r - 1)),
-          near_b(means_of(b, window, r - 1)) {
-        const auto spread = [](int radius) { return (2 * radius + 1) * (2 * radius + 1) - 1.0; };
-        const double ratio = spread(r) / (spread(r) - spread(r - 1));
-        curvature = ratio * ratio;
+    Smoothed(const float* half, const float* other, const Bucket& window) {
+        for (int r = 0; r <= largest; ++r) {
+            a.push_back(means_of(half, window, r));
+            b.push_back(means_of(other, window, r));
+        }
     }
 
-    /// Of the mean of both halves, an estimate of the variance that the squares leave.
-    double variance(std::size_t pixel) const {
-        const double apart = wide_a[pixel] - wide_b[pixel];
+    /// Of the mean of both halves, an estimate of the variance that squares leave.
+    double variance(std::size_t r, std::size_t pixel) const {
+        const double apart = a[r][pixel] - b[r][pixel];
         return apart * apart / 4.0;
     }
 
-    /// An estimate of the squared bias of the squares: of what they differ by from the next smaller
+    /// An estimate of the squared bias of squares: of what they differ by from the next smaller
     /// ones, of the other half so that noise does not meet itself. (The pixels of the smaller ones
     /// are also in the larger, which takes twice their variance off again.) Where an image is
     /// curved the bias of a mean grows as the variance of its square's pixels, side^2 - 1, and so
     /// it is in proportion to that difference.
-    double squared_bias(std::size_t pixel) const {
-        const double apart = wide_a[pixel] - wide_b[pixel];
-        const double shift = (wide_a[pixel] - near_b[pixel]) * (wide_b[pixel] - near_a[pixel]);
-        return curvature * (shift + apart * apart);
+    double squared_bias(std::size_t r, std::size_t pixel) const {
+        const auto spread = [](std::size_t radius) {
+            const double side = 2.0 * static_cast<double>(radius) + 1.0;
+            return side * side - 1.0;
+        };
+        const double curvature = spread(r) / (spread(r) - spread(r - 1));
+        const double apart = a[r][pixel] - b[r][pixel];
+        const double shift = (a[r][pixel] - b[r - 1][pixel]) * (b[r][pixel] - a[r - 1][pixel]);
+        return curvature * curvature * (shift + apart * apart);
     }
 
-    double level(std::size_t pixel) const { return (near_a[pixel] + near_b[pixel]) / 2.0; }
+    double level(std::size_t pixel) const { return (a[1][pixel] + b[1][pixel]) / 2.0; }
 
-    Means wide_a, wide_b, near_a, near_b;
-    double curvature;
+    std::vector<Means> a, b;
 };
 
 constexpr int block = 8;  // what smoothing leaves of noise is alike from pixel to pixel
 constexpr int fewest_blocks = 8;
 
-/// What squares leave, relative to the image: means over whole blocks and channels.
+/// What squares of a radius leave, relative to the image: means over whole blocks and channels.
 struct Left {
-    Left(const std::array<Smoothed, 3>& channels, const Bucket& window) {
+    Left(const std::array<Smoothed, 3>& channels, const Bucket& window, std::size_t r) {
         for (int y0 = 0; y0 + block <= window.height(); y0 += block) {
             for (int x0 = 0; x0 + block <= window.width(); x0 += block)
-                add(channels, window, x0, y0);
+                add(channels, window, r, x0, y0);
         }
     }
 
-    void add(const std::array<Smoothed, 3>& channels, const Bucket& window, int x0, int y0) {
+    void add(const std::array<Smoothed, 3>& channels, const Bucket& window, std::size_t r, int x0,
+             int y0) {
         double block_variance = 0.0, block_bias = 0.0;
         for (const Smoothed& channel : channels) {
             double level = 0.0, variances = 0.0, biases = 0.0;
@@ -97,8 +101,8 @@ struct Left {
                 for (int x = x0; x < x0 + block; ++x) {
                     const auto pixel = static_cast<std::size_t>(y * window.width() + x);
                     level += channel.level(pixel) / (block * block);
-                    variances += channel.variance(pixel) / (block * block);
-                    biases += channel.squared_bias(pixel) / (block * block);
+                    variances += channel.variance(r, pixel) / (block * block);
+                    biases += channel.squared_bias(r, pixel) / (block * block);
                 }
             }
             const double scale = 1.0 / (level * level + 0.01) / 3.0;
@@ -122,17 +126,15 @@ double smoothed_error(const Partial& half, const Partial& other) {
         return std::numeric_limits<double>::infinity();
     double greatest = 0.0;
     for (std::size_t look = 0; look < half.image.looks().size(); ++look) {
-        const auto left_by = [&](int radius) {
-            const auto smoothed = [&](std::size_t channel) {
-                return Smoothed(half.image.plane(look, channel), other.image.plane(look, channel),
-                                window, radius);
-            };
-            return Left({smoothed(Partial::r), smoothed(Partial::g), smoothed(Partial::b)}, window);
+        const auto smoothed = [&](std::size_t channel) {
+            return Smoothed(half.image.plane(look, channel), other.image.plane(look, channel),
+                            window);
         };
-        const Left finest = left_by(1);
+        const std::array channels{smoothed(Partial::r), smoothed(Partial::g), smoothed(Partial::b)};
+        const Left finest(channels, window, 1);
         double least = finest.squared_error.upper();
-        for (const int radius : {2, 3, 4}) {
-            const Left left = left_by(radius);
+        for (std::size_t r = 2; r <= largest; ++r) {
+            const Left left(channels, window, r);
             // Detail as fine as pixels is lost on the larger squares and the next smaller ones
             // alike.
             least = std::min(least, std::max(left.squared_error.upper(),

@@ -20,7 +20,7 @@ from pileus_worker import scene
 
 PILOT_PIXELS = 1024
 FEWEST_PIXELS = 128
-PILOT_SHARE = 0.04  # of the pixel samples that the frame seems to need
+PILOT_SHARE = 0.02  # of the pixel samples that the frame seems to need
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
 BLOCK = 4
@@ -101,8 +101,8 @@ class Pilot:
         )
         self._shot, self._frame, self._threads, self._control = shot, frame, threads, control
         self._size = (width, height)
-        # Of the frame's samples a pixel, for each of two halves, whole and by order.
-        self._share = PILOT_SHARE * pixels / (4 * width * height)
+        # Of the frame's samples a pixel, for each of two halves.
+        self._share = PILOT_SHARE * pixels / (2 * width * height)
         self._scene = scene.make_scene(small, frame, volume, reading)
 
     def opacity(self) -> float:

@@ -65,7 +65,7 @@ class Sampler:
         """The buckets with all of the samples, or from 0 on with as many as their error wants.
 
         What is to be denoised grows as two independent halves: they tell what smoothing leaves of
-        its error, and a denoiser does no worse."""
+        its error, which is what the denoiser is trusted with (docs/denoising.md)."""
         if self._resolved.noise is None:
             return self._render([(bucket, samples) for bucket in buckets])
         count = 2 if self._shot.image.denoise and samples[1] > 1 else 1

@@ -92,8 +92,8 @@ class Renderer:
             )
         if unmet:
             self._display.note(
-                f"frame {number}: warning: {unmet} buckets have taken all {shot.sampling.samples} "
-                "samples and are not within the tolerance; raise sampling.samples"
+                f"frame {number}: warning: {unmet} of its buckets have had all the samples they "
+                "may have and are not within the tolerance; raise sampling.samples"
             )
         error = frame.relative_error()
         return {
@@ -103,7 +103,8 @@ class Renderer:
             "load_seconds": volume.load_seconds,
             "render_seconds": render_seconds,
             "samples": round(frame.mean_samples),
-            "error": error if math.isfinite(error) else None,
+            "error": error if math.isfinite(error) else None,  # of what was rendered
+            "unmet_buckets": unmet,
             "method": resolved.method,
             "max_bounces": resolved.max_bounces,
             "reason": resolved.reason,
