@@ -78,7 +78,7 @@ class Stream {
     void run() {
         start();
         while (!flying_.empty()) {
-            if (work_.control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
+            end_if_cancelled();
             tracker_.run();
             go_on();
             // Many at once, so that camera rays, too, fill the lanes.
@@ -93,6 +93,10 @@ class Stream {
     static constexpr std::size_t in_flight = 256;
     // A batch waits for its longest path, and no more than so many batches wait.
     static constexpr std::size_t most_batches = 8;
+
+    void end_if_cancelled() const {
+        if (work_.control.cancelled.load(std::memory_order_relaxed)) throw Cancelled();
+    }
 
     void start() {
         while (!idle_.empty()) {
@@ -132,6 +136,7 @@ class Stream {
 
     /// Begins another batch of the tile, or of the next one.
     bool gather() {
+        end_if_cancelled();
         settle();
         if (batches_.size() == most_batches) return false;
         if (!tile_) {

@@ -269,11 +269,16 @@ TEST(Render, TheLastOrderHoldsAllLaterOnes) {
 }
 
 TEST(Render, EndsWhenCancelled) {
-    const Scene scene = make_rough_scene();
+    Scene scene = make_rough_scene();
     Control control;
     control.cancelled = true;
     EXPECT_THROW(
         render(scene, test::transport_of("multiple"), {whole, {0, 1000000}, 1, 1, 0}, 0, control),
+        Cancelled);
+    // Also where no ray meets the volume.
+    scene.camera = Camera(V3d(0.4, 0.8, -2.0), V3d(0.4, 0.8, -9.0), V3d(0.0, 1.0, 0.0), 40.0);
+    EXPECT_THROW(
+        render(scene, test::transport_of("multiple"), {whole, {0, 4}, 1, 1, 0}, 0, control),
         Cancelled);
 }
 
