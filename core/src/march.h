@@ -71,7 +71,7 @@ class DensityMarch {
     static constexpr float opaque = 8.0f;
     // Optical depth of a long step under the majorant: the cost then follows the light, not the
     // voxels.
-    static constexpr float thin = 0.2f;
+    static constexpr float thin = 0.3f;
     static constexpr float golden = 0.618034f;
 
     std::vector<Step> steps_;

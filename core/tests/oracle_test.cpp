@@ -393,12 +393,14 @@ TEST(BeerLambert, AlphaAndBackgroundAreThoseOfTheExactOpticalDepth) {
         const Partial partial = test::render_whole(scene, test::transport_of(method, 1), 256);
         const auto alpha = test::estimate(partial, Partial::a);
         EXPECT_LT(alpha.error, 2e-3);
+        // A march errs by its steps, each of which reads a rough field once.
+        const double bias = method == std::string("reference") ? 5e-4 : 1e-3;
         EXPECT_NEAR(alpha.mean, -std::expm1(-depth),
-                    test::z_limit(confidence, 10) * alpha.error + 5e-4)
+                    test::z_limit(confidence, 10) * alpha.error + bias)
             << method;
         const auto seen = test::estimate(partial, Partial::g);
         EXPECT_NEAR(seen.mean, 2.0 * std::exp(-depth),
-                    test::z_limit(confidence, 10) * seen.error + 1e-3)
+                    test::z_limit(confidence, 10) * seen.error + 2.0 * bias)
             << method;
     }
 }

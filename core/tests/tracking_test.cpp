@@ -292,7 +292,7 @@ TEST_F(TrackingTest, TheMarchSumsTheOpticalDepthWithoutBias) {
             march.march(*medium_, along, (float(i) + 0.5f) / jitters);
             sum += -std::log1p(-double(march.opacity()));
         }
-        EXPECT_NEAR(sum / jitters, tau, 1e-4 * tau + 2e-7 * std::exp(tau));
+        EXPECT_NEAR(sum / jitters, tau, 2e-4 * tau + 2e-7 * std::exp(tau));
     }
 }
 
@@ -306,10 +306,10 @@ TEST_F(TrackingTest, TheMarchInvertsItsOwnOpacity) {
             const float t = march.invert(u);
             ASSERT_GE(t, previous * (1.0f - 1e-6f));
             previous = t;
-            // Steps are at most a voxel long, and the field changes by less than one over a voxel:
-            // the depth up to t is the march's own up to that.
+            // A step's optical depth under the majorant is at most 0.3: the depth up to t is the
+            // march's own up to that, and what its reads of a rough field err by.
             const double expected = -std::log1p(-double(u * march.opacity()));
-            ASSERT_NEAR(depth(along, t), expected, 0.25 * medium_->majorant(1.0f) * 0.1 * 4.0);
+            ASSERT_NEAR(depth(along, t), expected, 0.4);
         }
         EXPECT_LT(march.invert(std::nextafter(1.0f, 0.0f)), everything);
     }
