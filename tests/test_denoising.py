@@ -122,6 +122,19 @@ def test_the_tolerance_is_that_of_the_denoised_image(noisy: Shot, tmp_path: Path
             assert rel_mse(channels, truth[look], "noisy.") > 2 * rel_mse(more[look], truth[look])
 
 
+def test_a_haze_that_one_sample_shows_takes_one(noisy: Shot, tmp_path: Path) -> None:
+    thin = noisy.volumes[0].model_copy(update={"extinction": 0.3})
+    shot = changed(noisy, "sampling", samples=4096, tolerance=0.1)
+    shot = shot.model_copy(update={"volumes": (thin,)})
+    own = rendered(shot, tmp_path / "denoised.exr")
+    plain = rendered(changed(shot, "image", denoise=False), tmp_path / "plain.exr")
+    one = changed(shot, "sampling", samples=1, tolerance=None)
+    alone = rendered(changed(one, "image", denoise=False), tmp_path / "one.exr")
+    for look, channels in own.items():
+        np.testing.assert_array_equal(channels["noisy.R"], plain[look]["R"])
+        np.testing.assert_array_equal(channels["A"], alone[look]["A"])
+
+
 def test_partials_serve_with_a_filter_and_without_unless_it_sets_their_samples(
     noisy: Shot,
 ) -> None:

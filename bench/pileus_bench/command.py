@@ -35,7 +35,7 @@ SMALL = Plan(
     scale=0.5,
 )
 FULL = Plan(
-    budgets=(0.5, 2.0, 8.0),
+    budgets=(0.5, 4.0),
     tolerances=(0.1, 0.05, 0.025),
     repeats=3,
     truth_noise=2e-4,

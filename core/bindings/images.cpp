@@ -131,10 +131,11 @@ void bind_partial_and_frame(nb::module_& m) {
         .def_static("read", &Partial::read, "path"_a, nb::call_guard<nb::gil_scoped_release>(),
                     "Raises InputError for a file that is truncated, altered or no partial.");
 
-    m.def("smoothed_error", &smoothed_error, "half"_a, "other"_a,
+    m.def("smoothed_error", &smoothed_error, "half"_a, "other"_a, "margin"_a,
           nb::call_guard<nb::gil_scoped_release>(),
           "The RMS relative error of two independent halves of a bucket's samples together, once "
-          "they are smoothed. Infinite where there are too few pixels to know.");
+          "they are smoothed, and `margin` standard errors more. Infinite where there are too few "
+          "pixels to know.");
 
     nb::class_<Frame>(m, "Frame", "The merge of partials into one image.")
         .def(

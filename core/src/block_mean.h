@@ -17,12 +17,12 @@ class BlockMean {
 
     double mean() const { return sum_ / count_; }
 
-    /// One standard error above the mean: where rare bright paths make the noise, few blocks tell
-    /// of it. Infinite where there is none.
-    double upper() const {
+    /// So many standard errors above the mean: where rare bright paths make the noise, few blocks
+    /// tell of it. Infinite where there is none.
+    double upper(double margin) const {
         if (count_ == 0) return std::numeric_limits<double>::infinity();
         const double spread = squares_ / count_ - mean() * mean();
-        return mean() + std::sqrt(std::max(0.0, spread) / count_);
+        return mean() + margin * std::sqrt(std::max(0.0, spread) / count_);
     }
 
   private:

@@ -69,8 +69,8 @@ struct Partial {
 
 /// The RMS relative error of two independent halves of a bucket's samples together, once each pixel
 /// is the mean over a square of 3x3 to 9x9 pixels about it, whichever serves best; of the look
-/// where it is greatest, and one standard error more. Infinite where there are too few pixels to
-/// know. Throws as `check_alike` does.
-double smoothed_error(const Partial& half, const Partial& other);
+/// where it is greatest, and `margin` standard errors more. Infinite where there are too few pixels
+/// to know. Throws as `check_alike` does.
+double smoothed_error(const Partial& half, const Partial& other, double margin);
 
 }  // namespace pileus

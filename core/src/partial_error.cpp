@@ -11,9 +11,11 @@ namespace pileus {
 
 namespace {
 
-// A pixel that has missed its rare bright paths has too small a variance, and one that has met them
-// too large a mean: pixel by pixel the ratio would be too small. Blocks even that out.
-constexpr int block = 4;
+/// The side of the blocks that are looked at. A pixel that has missed its rare bright paths has too
+/// small a variance, and one that has met them too large a mean: pixel by pixel the ratio would be
+/// too small. Blocks even that out, but take the noise of bright pixels for that of the dark ones
+/// beside them, too: where pixels have many samples, smaller blocks hold enough.
+int block_of(const SampleRange& samples) { return samples.count() < 16 ? 4 : 2; }
 
 /// One channel of a bucket.
 struct Pixels {
@@ -39,7 +41,7 @@ struct Pixels {
     }
 
     /// The mean over those of a block's pixels where there is one.
-    std::optional<double> over_block(int x0, int y0,
+    std::optional<double> over_block(int x0, int y0, int block,
                                      std::optional<double> (Pixels::*of)(int, int) const) const {
         double sum = 0.0;
         int count = 0;
@@ -58,33 +60,53 @@ struct Pixels {
     int width, height;
 };
 
+constexpr double margin = 1.0;  // standard errors
+
+using Channels = std::array<Pixels, 3>;
+
+/// The mean over blocks of a quantity relative to the image. The channels of a block are one, for
+/// they see the same paths.
+BlockMean relative(const Channels& image, const Channels& quantity, int block,
+                   std::optional<double> (Pixels::*of)(int, int) const) {
+    BlockMean mean;
+    for (int y = 0; y < image[0].height; y += block) {
+        for (int x = 0; x < image[0].width; x += block) {
+            double sum = 0.0;
+            int channels = 0;
+            for (std::size_t c = 0; c < 3; ++c) {
+                const double level = image[c].over_block(x, y, block, &Pixels::at).value_or(0.0);
+                if (const auto value = quantity[c].over_block(x, y, block, of)) {
+                    sum += *value / (level * level + 0.01);
+                    ++channels;
+                }
+            }
+            if (channels > 0) mean.add(sum / channels);
+        }
+    }
+    return mean;
+}
+
 }  // namespace
 
 double Partial::relative_error() const {
+    const int block = block_of(samples);
+    const std::size_t pixels = image.window().pixels();
     double greatest = 0.0;
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
-        BlockMean by_samples, by_neighbours, by_ranges;
-        for (std::size_t c = 0; c < 3; ++c) {
-            const Pixels mean{image.plane(look, r + c), image.window()};
-            const Pixels variance{image.plane(look, variance_r + c), image.window()};
-            for (int y = 0; y < mean.height; y += block) {
-                for (int x = 0; x < mean.width; x += block) {
-                    const double level = mean.over_block(x, y, &Pixels::at).value_or(0.0);
-                    const double scale = 1.0 / (level * level + 0.01);
-                    if (samples.count() > 1)
-                        by_samples.add(scale * *variance.over_block(x, y, &Pixels::at));
-                    if (const auto ripple = mean.over_block(x, y, &Pixels::ripple))
-                        by_neighbours.add(scale * *ripple);
-                    if (!apart.empty()) {
-                        const Pixels ranges{apart.data() + (look * 3 + c) * image.window().pixels(),
-                                            image.window()};
-                        by_ranges.add(scale * *ranges.over_block(x, y, &Pixels::at));
-                    }
-                }
-            }
+        const auto channels = [&](const float* first) {
+            return Channels{Pixels{first, image.window()}, Pixels{first + pixels, image.window()},
+                            Pixels{first + 2 * pixels, image.window()}};
+        };
+        const Channels means = channels(image.plane(look, r));
+        const Channels variances = channels(image.plane(look, variance_r));
+        double least = relative(means, means, block, &Pixels::ripple).upper(margin);
+        if (samples.count() > 1)
+            least = std::min(least, relative(means, variances, block, &Pixels::at).upper(margin));
+        if (!apart.empty()) {
+            const Channels ranges = channels(apart.data() + look * 3 * pixels);
+            least = std::min(least, relative(means, ranges, block, &Pixels::at).upper(margin));
         }
-        greatest = std::max(
-            greatest, std::min({by_samples.upper(), by_neighbours.upper(), by_ranges.upper()}));
+        greatest = std::max(greatest, least);
     }
     return std::sqrt(greatest);
 }

@@ -119,7 +119,7 @@ struct Left {
 
 }  // namespace
 
-double smoothed_error(const Partial& half, const Partial& other) {
+double smoothed_error(const Partial& half, const Partial& other, double margin) {
     half.check_alike(other);
     const Bucket& window = half.image.window();
     if ((window.width() / block) * (window.height() / block) < fewest_blocks)
@@ -132,12 +132,12 @@ double smoothed_error(const Partial& half, const Partial& other) {
         };
         const std::array channels{smoothed(Partial::r), smoothed(Partial::g), smoothed(Partial::b)};
         const Left finest(channels, window, 1);
-        double least = finest.squared_error.upper();
+        double least = finest.squared_error.upper(margin);
         for (std::size_t r = 2; r <= largest; ++r) {
             const Left left(channels, window, r);
             // Detail as fine as pixels is lost on the larger squares and the next smaller ones
             // alike.
-            least = std::min(least, std::max(left.squared_error.upper(),
+            least = std::min(least, std::max(left.squared_error.upper(margin),
                                              left.variance.mean() + finest.squared_bias.mean()));
         }
         greatest = std::max(greatest, least);

@@ -84,6 +84,26 @@ TEST(Partial, TellsItsErrorBySamplesNeighboursOrRangesWhicheverSaysLeast) {
     EXPECT_NEAR(pooled.relative_error(), exact, 0.15 * exact);
 }
 
+TEST(Partial, OfManySamplesTellsBrightPixelsFromTheDarkOnesBesideThem) {
+    // Squares of 2x2 pixels by turns: bright ones with noise, dark ones without.
+    Partial partial = noisy(0.1, 0.0, 0.0);
+    for (int y = 0; y < height; ++y) {
+        for (int x = 0; x < width; ++x) {
+            if ((x / 2 + y / 2) % 2 != 0) continue;
+            for (std::size_t c = 0; c < 3; ++c) {
+                partial.image.plane(0, Partial::r + c)[y * width + x] = 2.0F;
+                partial.image.plane(0, Partial::variance_r + c)[y * width + x] = 0.01F;
+            }
+        }
+    }
+    const double exact = std::sqrt(0.01 / 4.01 / 2.0);
+    partial.samples = {0, 64};
+    EXPECT_NEAR(partial.relative_error(), exact, 0.06 * exact);
+    // Few samples would be trusted too far: they are believed to be as noisy as all of a block.
+    partial.samples = {0, 8};
+    EXPECT_GT(partial.relative_error(), 1.3 * exact);
+}
+
 TEST(Partial, OfOneSampleTellsItsErrorByNeighboursAlone) {
     Partial partial = noisy(2.0, 0.01, 0.0);
     partial.samples = {0, 1};

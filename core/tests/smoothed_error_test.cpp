@@ -69,7 +69,7 @@ TEST_P(SmoothedErrorTest, IsThatOfTheBestSquare) {
     constexpr int side = 256;
     const Case& each = GetParam();
     const double estimate = smoothed_error(noisy(side, each.truth, each.variance, 1),
-                                           noisy(side, each.truth, each.variance, 2));
+                                           noisy(side, each.truth, each.variance, 2), 1.0);
     const double ratio = estimate * estimate / tried(side, each.truth, each.variance);
     EXPECT_GT(ratio, each.low);
     EXPECT_LT(ratio, each.high);
@@ -94,12 +94,21 @@ INSTANTIATE_TEST_SUITE_P(
         Case{"Checkers", [](int x, int y) { return (x + y) % 2 ? 1.2 : 0.8; }, 0.02, 0.85, 1.4}),
     [](const auto& info) { return info.param.name; });
 
+TEST(SmoothedError, HasItsMarginOnTop) {
+    const Truth flat = [](int, int) { return 1.0; };
+    const Partial half = noisy(64, flat, 0.1, 1), other = noisy(64, flat, 0.1, 2);
+    const double least = smoothed_error(half, other, 0.0);
+    EXPECT_GT(least, 0.0);
+    EXPECT_GT(smoothed_error(half, other, 0.5), least);
+    EXPECT_GT(smoothed_error(half, other, 1.0), smoothed_error(half, other, 0.5));
+}
+
 TEST(SmoothedError, IsUnknownOfFewPixelsAndRefusedForUnlikeBuckets) {
     const Truth flat = [](int, int) { return 1.0; };
     const Partial small = noisy(23, flat, 0.1, 1), half = noisy(24, flat, 0.1, 1);
-    EXPECT_TRUE(std::isinf(smoothed_error(small, small)));
-    EXPECT_TRUE(std::isfinite(smoothed_error(half, noisy(24, flat, 0.1, 2))));
-    EXPECT_THROW(smoothed_error(small, half), InputError);
+    EXPECT_TRUE(std::isinf(smoothed_error(small, small, 1.0)));
+    EXPECT_TRUE(std::isfinite(smoothed_error(half, noisy(24, flat, 0.1, 2), 1.0)));
+    EXPECT_THROW(smoothed_error(small, half, 1.0), InputError);
 }
 
 }  // namespace

@@ -20,13 +20,15 @@ from pileus_worker import planning, scene
 # much smaller.
 EVEN = 0.1
 # From a round that is too short to know, not too far.
-GROWTH = 4
+GROWTH = 3
+# Of the frame's standard errors, what a bucket's smoothing has on top: 95 % are within as many.
+MARGIN = 1.65
 # The buckets whose rounds go together, for threads wait for each other after each.
 TOGETHER = 64
 # What a smoothed image errs by falls more slowly than noise does: as the inverse of this power of
 # the samples or a greater one.
 SMOOTHED_POWER = 0.7
-Halves = tuple[core.Partial, ...]  # one or two
+Halves = list[core.Partial]  # one or two
 
 
 class Sampler:
@@ -70,14 +72,19 @@ class Sampler:
             return self._render([(bucket, samples) for bucket in buckets])
         count = 2 if self._shot.image.denoise and samples[1] > 1 else 1
         most = samples[1] // count
-        first = [(bucket, (0, 1)) for bucket in buckets]
-        growing = list(zip(*(self._render(first, half) for half in range(count)), strict=True))
+        growing = [[part] for part in self._render([(bucket, (0, 1)) for bucket in buckets])]
+        if count == 2:
+            # One sample may do, which then needs no other half.
+            paired = [halves for halves in growing if self._wanted(halves) > 1]
+            first = [(halves[0].bucket, (0, 1)) for halves in paired]
+            for halves, other in zip(paired, self._render(first, half=1), strict=True):
+                halves.append(other)
         pending = self._pending(growing, most)
         while pending:
             ranges = [(halves[0].bucket, (_taken(halves), wanted)) for halves, wanted in pending]
-            for half in range(count):
-                for (halves, _), more in zip(pending, self._render(ranges, half), strict=True):
-                    halves[half].pool(more)
+            for number in range(count):
+                for (halves, _), more in zip(pending, self._render(ranges, number), strict=True):
+                    halves[number].pool(more)
             pending = self._pending([halves for halves, _ in pending], most)
         for whole, *rest in growing:
             for half in rest:
@@ -108,9 +115,17 @@ class Sampler:
         # n / (1 + 1 / n).
         wanted = (needed + math.sqrt(needed * (needed + 4))) / 2
         if len(halves) == 2 and wanted > taken:
-            error = core.smoothed_error(*halves) ** 2
+            half, other = halves
+            error = core.smoothed_error(half, other, self._margin(half.bucket)) ** 2
             wanted = min(wanted, taken * (error / allowed) ** (1 / SMOOTHED_POWER))
         return math.ceil(min(wanted, GROWTH * taken))
+
+    def _margin(self, bucket: Bucket) -> float:
+        """How many of its own standard errors a bucket's smoothing has on top: the fewer the more
+        buckets there are, whose errors even out over the frame; but no more than one."""
+        x0, y0, x1, y1 = bucket
+        share = (x1 - x0) * (y1 - y0) / (self._shot.image.width * self._shot.image.height)
+        return min(1.0, MARGIN * math.sqrt(share))
 
     def _render(
         self, parts: list[tuple[Bucket, tuple[int, int]]], half: int = 0
