@@ -154,6 +154,21 @@ def test_auto_decides_and_samples_in_the_farm_as_here(
             np.testing.assert_array_equal(farm[name], values, name)
 
 
+def test_buckets_that_miss_the_tolerance_are_told(
+    client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    shot = real_shot.model_copy(update={"sampling": Sampling(samples=2, tolerance=1e-3)})
+    job = client.submit(shot).job.id
+    finish(client, job)
+    file = tmp_path / "shot.json"
+    file.write_text(shot.model_dump_json())
+    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
+    ended = subprocess.run(command, check=True, capture_output=True, text=True)
+    here = [report["unmet_buckets"] for report in json.loads(ended.stdout)["frames"]]
+    assert min(here) > 0
+    assert [frame.unmet_buckets for frame in client.frames(job)] == here
+
+
 def test_killed_workers_change_no_bit(
     farm: EmbeddedFarm, client: Client, long_shot: Shot, tmp_path: Path
 ) -> None:

@@ -86,6 +86,8 @@ void bind_partial_and_frame(nb::module_& m) {
         .def_prop_ro("looks", [](const Partial& p) { return p.image.looks(); })
         .def_ro("identity", &Partial::identity)
         .def_ro("bounded_paths", &Partial::bounded_paths, "Paths that the bound on work has ended.")
+        .def_rw("unmet", &Partial::unmet,
+                "It has had all the samples it may have, and misses its share of the tolerance.")
         .def(
             "relative_error", &Partial::relative_error,
             "The RMS relative error of its pixels for their noise, one standard error more than it "
@@ -169,6 +171,9 @@ void bind_partial_and_frame(nb::module_& m) {
              "The RMS relative error of the pixels, from their variances.")
         .def_prop_ro("bounded_paths", &Frame::bounded_paths,
                      "Paths that the bound on work has ended, of all partials.")
+        .def_prop_ro("unmet_buckets", &Frame::unmet_buckets,
+                     "Those that have had all the samples they may have, and miss their share of "
+                     "the tolerance.")
         .def(
             "set_denoised",
             [](Frame& frame,

@@ -71,6 +71,7 @@ void Frame::add(const Partial& partial) {
     tile->wanted = wanted;
     tile->reached = partial.samples.last;
     bounded_paths_ += partial.bounded_paths;
+    unmet_buckets_ += partial.unmet ? 1 : 0;
     const bool whole = tile->reached == wanted;
     std::vector<Partial>& held = tile->partials;
     held.push_back(partial);

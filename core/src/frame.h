@@ -41,6 +41,9 @@ class Frame {
     /// Paths that the bound on work has ended, of all partials.
     std::int64_t bounded_paths() const { return bounded_paths_; }
 
+    /// Buckets that have had all the samples they may have, and miss their share of the tolerance.
+    int unmet_buckets() const { return unmet_buckets_; }
+
   private:
     /// What has come of a bucket. Partials are pooled with others of about their size, as each
     /// pooling rounds to a float: one after the other, hundreds would drift, and late ones hardly
@@ -61,6 +64,7 @@ class Frame {
     std::string identity_;
     LayeredImage image_;
     std::int64_t bounded_paths_ = 0;
+    int unmet_buckets_ = 0;
 };
 
 }  // namespace pileus

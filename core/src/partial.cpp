@@ -27,6 +27,7 @@ std::string digest(const Partial& partial) {
         hash = hash_key(hash, static_cast<std::uint64_t>(number));
     }
     hash = hash_key(hash, static_cast<std::uint64_t>(partial.bounded_paths));
+    if (partial.unmet) hash = hash_key(hash, 1);
     fold_text(partial.identity);
     for (const auto& look : partial.image.looks()) fold_text(look);
     for (const float value : partial.image.data())
@@ -64,13 +65,14 @@ std::vector<std::string> channel_names(std::size_t orders) {
 }
 
 void Partial::write(const std::string& path) const {
-    const Header header{
+    Header header{
         {"pileusPartial", std::string(format_version)},
         {"pileusIdentity", identity},
         {"pileusSamples", std::to_string(samples.first) + " " + std::to_string(samples.last)},
         {"pileusBoundedPaths", std::to_string(bounded_paths)},
         {"pileusDigest", digest(*this)},
     };
+    if (unmet) header.emplace("pileusUnmet", std::string("1"));
     write_exr(path, image, width, height, false, header);
 }
 
@@ -97,6 +99,7 @@ Partial Partial::read(const std::string& path) {
         throw InputError(path + ": its header is damaged; render it again");
     }
     partial.bounded_paths = bounded;
+    partial.unmet = file.text.contains("pileusUnmet");
     const std::size_t all = file.image.channels().size(), fixed = Partial::first_order;
     if (all < fixed || (all - fixed) % 3 != 0)
         throw InputError(path + ": has not the channels of a partial");

@@ -35,6 +35,8 @@ struct Partial {
     SampleRange samples{};
     LayeredImage image;  // means over the samples; of one sample, the variance is told as 0
     std::int64_t bounded_paths = 0;
+    // It has had all the samples it may have, and is not within its share of the tolerance.
+    bool unmet = false;
     std::string identity;  // of the frame it belongs to: partials of different ones never mix
     // Of `pool_comparing`, by look, R, G, B and pixel; not part of a file.
     std::vector<float> apart;

@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <optional>
+#include <vector>
 
 namespace pileus {
 
@@ -17,71 +17,66 @@ namespace {
 /// beside them, too: where pixels have many samples, smaller blocks hold enough.
 int block_of(const SampleRange& samples) { return samples.count() < 16 ? 4 : 2; }
 
-/// One channel of a bucket.
-struct Pixels {
-    Pixels(const float* plane, const Bucket& window)
-        : values(plane), width(window.width()), height(window.height()) {}
+constexpr double margin = 1.0;  // standard errors
 
-    std::optional<double> at(int x, int y) const { return values[y * width + x]; }
+/// Squares of pixels of a bucket, by rows; those at the far edges are smaller.
+struct Blocks {
+    Blocks(const Bucket& window, int side)
+        : width(window.width()),
+          height(window.height()),
+          block(side),
+          columns((width + side - 1) / side),
+          rows((height + side - 1) / side) {}
+
+    /// The means over blocks of what `of` tells of the pixels (x, y) from `inset` pixels off the
+    /// edges on. Where a block has none of these: NaN.
+    template <typename Of>
+    std::vector<double> means(int inset, const Of& of) const {
+        const auto blocks = static_cast<std::size_t>(columns) * static_cast<std::size_t>(rows);
+        std::vector<double> sums(blocks, 0.0), counts(blocks, 0.0);
+        for (int y = inset; y < height - inset; ++y) {
+            for (int x = inset; x < width - inset; ++x) {
+                const auto i = static_cast<std::size_t>(y / block * columns + x / block);
+                sums[i] += of(x, y);
+                counts[i] += 1.0;
+            }
+        }
+        for (std::size_t i = 0; i < blocks; ++i) sums[i] /= counts[i];
+        return sums;
+    }
+
+    std::vector<double> means(const float* plane) const {
+        return means(0, [&](int x, int y) { return double{plane[y * width + x]}; });
+    }
 
     /// What noise that is independent from pixel to pixel leaves of a 3x3 neighbourhood from which
     /// all that is linear along rows or columns has been taken; scaled so that its mean is the
     /// variance (Immerkaer 1996).
-    std::optional<double> ripple(int x, int y) const {
-        if (x < 1 || y < 1 || x + 1 >= width || y + 1 >= height) return std::nullopt;
-        constexpr std::array kernel{1.0, -2.0, 1.0};
-        double sum = 0.0;
-        for (int j = 0; j < 3; ++j) {
-            for (int i = 0; i < 3; ++i) {
-                sum += kernel[static_cast<std::size_t>(i)] * kernel[static_cast<std::size_t>(j)] *
-                       values[(y + j - 1) * width + x + i - 1];
-            }
-        }
-        return sum * sum / 36.0;
+    std::vector<double> ripples(const float* plane) const {
+        return means(1, [&](int x, int y) {
+            const auto bend = [&](int row) {
+                const float* const p = plane + row * width + x;
+                return double{p[-1]} - 2.0 * double{p[0]} + double{p[1]};
+            };
+            const double sum = bend(y - 1) - 2.0 * bend(y) + bend(y + 1);
+            return sum * sum / 36.0;
+        });
     }
 
-    /// The mean over those of a block's pixels where there is one.
-    std::optional<double> over_block(int x0, int y0, int block,
-                                     std::optional<double> (Pixels::*of)(int, int) const) const {
-        double sum = 0.0;
-        int count = 0;
-        for (int y = y0; y < std::min(y0 + block, height); ++y) {
-            for (int x = x0; x < std::min(x0 + block, width); ++x) {
-                if (const auto value = (this->*of)(x, y)) {
-                    sum += *value;
-                    ++count;
-                }
-            }
-        }
-        return count > 0 ? std::optional(sum / count) : std::nullopt;
-    }
-
-    const float* values;
-    int width, height;
+    int width, height, block, columns, rows;
 };
 
-constexpr double margin = 1.0;  // standard errors
-
-using Channels = std::array<Pixels, 3>;
+using Channels = std::array<std::vector<double>, 3>;  // by block
 
 /// The mean over blocks of a quantity relative to the image. The channels of a block are one, for
 /// they see the same paths.
-BlockMean relative(const Channels& image, const Channels& quantity, int block,
-                   std::optional<double> (Pixels::*of)(int, int) const) {
+BlockMean relative(const Channels& levels, const Channels& quantity) {
     BlockMean mean;
-    for (int y = 0; y < image[0].height; y += block) {
-        for (int x = 0; x < image[0].width; x += block) {
-            double sum = 0.0;
-            int channels = 0;
-            for (std::size_t c = 0; c < 3; ++c) {
-                const double level = image[c].over_block(x, y, block, &Pixels::at).value_or(0.0);
-                if (const auto value = quantity[c].over_block(x, y, block, of)) {
-                    sum += *value / (level * level + 0.01);
-                    ++channels;
-                }
-            }
-            if (channels > 0) mean.add(sum / channels);
-        }
+    for (std::size_t i = 0; i < levels[0].size(); ++i) {
+        double sum = 0.0;
+        for (std::size_t c = 0; c < 3; ++c)
+            sum += quantity[c][i] / (levels[c][i] * levels[c][i] + 0.01);
+        if (!std::isnan(sum)) mean.add(sum / 3.0);
     }
     return mean;
 }
@@ -89,23 +84,20 @@ BlockMean relative(const Channels& image, const Channels& quantity, int block,
 }  // namespace
 
 double Partial::relative_error() const {
-    const int block = block_of(samples);
+    const Blocks blocks(image.window(), block_of(samples));
     const std::size_t pixels = image.window().pixels();
     double greatest = 0.0;
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
-        const auto channels = [&](const float* first) {
-            return Channels{Pixels{first, image.window()}, Pixels{first + pixels, image.window()},
-                            Pixels{first + 2 * pixels, image.window()}};
-        };
-        const Channels means = channels(image.plane(look, r));
-        const Channels variances = channels(image.plane(look, variance_r));
-        double least = relative(means, means, block, &Pixels::ripple).upper(margin);
-        if (samples.count() > 1)
-            least = std::min(least, relative(means, variances, block, &Pixels::at).upper(margin));
-        if (!apart.empty()) {
-            const Channels ranges = channels(apart.data() + look * 3 * pixels);
-            least = std::min(least, relative(means, ranges, block, &Pixels::at).upper(margin));
+        Channels levels, ripples, variances, ranges;
+        for (std::size_t c = 0; c < 3; ++c) {
+            levels[c] = blocks.means(image.plane(look, r + c));
+            ripples[c] = blocks.ripples(image.plane(look, r + c));
+            if (samples.count() > 1) variances[c] = blocks.means(image.plane(look, variance_r + c));
+            if (!apart.empty()) ranges[c] = blocks.means(apart.data() + (look * 3 + c) * pixels);
         }
+        double least = relative(levels, ripples).upper(margin);
+        if (samples.count() > 1) least = std::min(least, relative(levels, variances).upper(margin));
+        if (!apart.empty()) least = std::min(least, relative(levels, ranges).upper(margin));
         greatest = std::max(greatest, least);
     }
     return std::sqrt(greatest);

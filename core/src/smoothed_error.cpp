@@ -15,31 +15,43 @@ namespace {
 
 using Means = std::vector<double>;  // by pixel
 
-/// Means over the squares of 2 r + 1 pixels' side about each pixel, cut off at the bucket's edges.
-Means means_of(const float* plane, const Bucket& window, int r) {
-    const int width = window.width(), height = window.height();
-    // Sums over all that lies above and to the left.
-    const auto at = [&](int x, int y) { return static_cast<std::size_t>(y * (width + 1) + x); };
-    std::vector<double> sums(at(0, height + 1), 0.0);
-    for (int y = 0; y < height; ++y) {
-        for (int x = 0; x < width; ++x) {
-            sums[at(x + 1, y + 1)] = double{plane[y * width + x]} + sums[at(x, y + 1)] +
-                                     sums[at(x + 1, y)] - sums[at(x, y)];
+/// The sums over all that lies above and to the left of each pixel's corners, of a plane.
+class SummedArea {
+  public:
+    SummedArea(const float* plane, const Bucket& window)
+        : width_(window.width()), height_(window.height()), sums_(at(0, height_ + 1), 0.0) {
+        for (int y = 0; y < height_; ++y) {
+            double row = 0.0;
+            for (int x = 0; x < width_; ++x) {
+                row += double{plane[y * width_ + x]};
+                sums_[at(x + 1, y + 1)] = sums_[at(x + 1, y)] + row;
+            }
         }
     }
-    Means means;
-    means.reserve(window.pixels());
-    for (int y = 0; y < height; ++y) {
-        const int y0 = std::max(0, y - r), y1 = std::min(height, y + r + 1);
-        for (int x = 0; x < width; ++x) {
-            const int x0 = std::max(0, x - r), x1 = std::min(width, x + r + 1);
-            const double sum =
-                sums[at(x1, y1)] - sums[at(x0, y1)] - sums[at(x1, y0)] + sums[at(x0, y0)];
-            means.push_back(sum / ((x1 - x0) * (y1 - y0)));
+
+    /// Means over the squares of 2 r + 1 pixels' side about each pixel, cut off at the edges.
+    Means means(int r) const {
+        Means means;
+        means.reserve(static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_));
+        for (int y = 0; y < height_; ++y) {
+            const int y0 = std::max(0, y - r), y1 = std::min(height_, y + r + 1);
+            const double* const above = &sums_[at(0, y0)];
+            const double* const below = &sums_[at(0, y1)];
+            for (int x = 0; x < width_; ++x) {
+                const int x0 = std::max(0, x - r), x1 = std::min(width_, x + r + 1);
+                const double sum = below[x1] - above[x1] - below[x0] + above[x0];
+                means.push_back(sum / ((x1 - x0) * (y1 - y0)));
+            }
         }
+        return means;
     }
-    return means;
-}
+
+  private:
+    std::size_t at(int x, int y) const { return static_cast<std::size_t>(y * (width_ + 1) + x); }
+
+    int width_, height_;
+    std::vector<double> sums_;
+};
 
 constexpr int largest = 4;  // radius of a square
 
@@ -47,9 +59,10 @@ constexpr int largest = 4;  // radius of a square
 /// radius; those of radius 0 are the pixels.
 struct Smoothed {
     Smoothed(const float* half, const float* other, const Bucket& window) {
+        const SummedArea of_half(half, window), of_other(other, window);
         for (int r = 0; r <= largest; ++r) {
-            a.push_back(means_of(half, window, r));
-            b.push_back(means_of(other, window, r));
+            a.push_back(of_half.means(r));
+            b.push_back(of_other.means(r));
         }
     }
 

@@ -113,6 +113,21 @@ TEST(Partial, OfOneSampleTellsItsErrorByNeighboursAlone) {
     EXPECT_TRUE(std::isinf(partial.relative_error()));
 }
 
+TEST(Partial, KeepsThatItMissesTheTolerance) {
+    const test::TemporaryFolder folder;
+    Frame frame(width, height, plan);
+    for (const Bucket& bucket : {left, right}) {
+        Partial partial = make_partial(bucket, {0, bucket == left ? 16 : 8}, "shot");
+        partial.unmet = bucket == left;
+        const std::string path = folder.path("partial.exr");
+        partial.write(path);
+        const Partial back = Partial::read(path);
+        EXPECT_EQ(back.unmet, partial.unmet);
+        frame.add(back);
+    }
+    EXPECT_EQ(frame.unmet_buckets(), 1);
+}
+
 TEST(Frame, PlanMustTileTheImage) {
     EXPECT_NE(refusal([] { Frame(width, height, {{left, 16}}); }), "");
     EXPECT_NE(refusal([] { Frame(width, height, {{left, 16}, {left, 16}, {right, 8}}); }), "");

@@ -175,6 +175,7 @@ class Farm:
                         seconds=done.seconds,
                         reason=done.reason,
                         bounded_paths=done.bounded_paths,
+                        unmet_buckets=done.unmet_buckets,
                     )
                 )
             else:

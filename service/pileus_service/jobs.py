@@ -145,6 +145,7 @@ class Done(Record):
     max_bounces: int | None
     reason: str
     bounded_paths: int = 0
+    unmet_buckets: int = 0
 
 
 class Task(Record):
@@ -260,6 +261,7 @@ class FrameView(Record):
     file: str | None = None
     seconds: float | None = None
     bounded_paths: int = 0
+    unmet_buckets: int = 0
 
 
 class FrameMap(Record):

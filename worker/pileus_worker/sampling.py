@@ -48,7 +48,6 @@ class Sampler:
         self._transport = scene.make_transport(shot, resolved)
         self._orders = (resolved.max_bounces or 0) if shot.image.orders else 0
         self._frame, self._threads, self._control = frame, threads, control
-        self.unmet = 0  # buckets that have had all samples and want more
 
     def whole(self, done: Callable[[int], None] = lambda pixels: None) -> core.Frame:
         """All of the frame; `done` hears of the pixels that are finished."""
@@ -97,7 +96,7 @@ class Sampler:
         for halves in growing:
             wanted = self._wanted(halves)
             if wanted > _taken(halves) == most:
-                self.unmet += 1
+                halves[0].unmet = True
             elif wanted > _taken(halves):
                 pending.append((halves, min(wanted, most)))
         return pending
@@ -109,15 +108,17 @@ class Sampler:
         opacity = sum(half.opacity for half in halves) / len(halves)
         share = EVEN + (1 - EVEN) * opacity / self._resolved.opacity
         allowed = self._resolved.noise**2 * share
-        error = max(half.relative_error() for half in halves) ** 2 / len(halves)
-        needed = error / allowed * taken
-        # Few samples have met few of the rare bright paths and make too little of them: n count as
-        # n / (1 + 1 / n).
-        wanted = (needed + math.sqrt(needed * (needed + 4))) / 2
-        if len(halves) == 2 and wanted > taken:
+        wanted = math.inf
+        if len(halves) == 2:
             half, other = halves
             error = core.smoothed_error(half, other, self._margin(half.bucket)) ** 2
-            wanted = min(wanted, taken * (error / allowed) ** (1 / SMOOTHED_POWER))
+            wanted = taken * (error / allowed) ** (1 / SMOOTHED_POWER)
+        if wanted > taken:
+            error = max(half.relative_error() for half in halves) ** 2 / len(halves)
+            needed = error / allowed * taken
+            # Few samples have met few of the rare bright paths and make too little of them: n count
+            # as n / (1 + 1 / n).
+            wanted = min(wanted, (needed + math.sqrt(needed * (needed + 4))) / 2)
         return math.ceil(min(wanted, GROWTH * taken))
 
     def _margin(self, bucket: Bucket) -> float:

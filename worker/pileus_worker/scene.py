@@ -116,10 +116,10 @@ def identity(shot: Shot, frame: int, files: Sequence[Cache]) -> str:
 
 
 def header(
-    shot: Shot, frame: int, resolved: Resolved, seconds: float, bounded_paths: int
+    shot: Shot, number: int, resolved: Resolved, seconds: float, frame: core.Frame
 ) -> Header:
-    """What a pipeline wants to know of an image."""
-    camera = make_camera(shot, frame)
+    """What a pipeline wants to know of the image of a frame."""
+    camera = make_camera(shot, number)
     rate = Fraction(shot.fps).limit_denominator(1001)
     return {
         "worldToCamera": camera.world_to_camera(),
@@ -127,8 +127,9 @@ def header(
         "framesPerSecond": (rate.numerator, rate.denominator),
         "renderTime": seconds,
         "software": f"Pileus {__version__}",
-        "pileus.frame": str(frame),
+        "pileus.frame": str(number),
         "pileus.shot": shot.model_dump_json(),
         "pileus.transport": resolved.model_dump_json(),
-        "pileus.boundedPaths": str(bounded_paths),
+        "pileus.boundedPaths": str(frame.bounded_paths),
+        "pileus.unmetBuckets": str(frame.unmet_buckets),
     }

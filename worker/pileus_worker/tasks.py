@@ -255,7 +255,7 @@ class Work:
             frame.write(
                 staged,
                 half=shot.image.pixel_type == "half",
-                header=scene.header(shot, self.frame, resolved, seconds, frame.bounded_paths),
+                header=scene.header(shot, self.frame, resolved, seconds, frame),
             )
             self.permit()
             Path(staged).replace(location)
@@ -271,6 +271,7 @@ class Work:
                 max_bounces=resolved.max_bounces,
                 reason=resolved.reason,
                 bounded_paths=frame.bounded_paths,
+                unmet_buckets=frame.unmet_buckets,
             )
         )
         self._tidy(files)

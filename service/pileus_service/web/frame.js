@@ -98,6 +98,7 @@ function showFacts(view) {
     Took: duration(view.seconds),
     File: view.file,
     Why: view.state === "done" ? "" : view.reason,
+    Noise: view.unmet_buckets ? `${view.unmet_buckets} buckets miss the tolerance` : "",
   };
   const list = at("#frame dl");
   list.replaceChildren();

@@ -77,12 +77,12 @@ class Renderer:
         if index + 1 < len(self._frames):
             self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
         rendering = time.monotonic()
-        resolved, frame, unmet = self._watched(index, number, volume)
+        resolved, frame = self._watched(index, number, volume)
         render_seconds = time.monotonic() - rendering
         denoise(frame, shot, self._threads)
         output = shot.output(number)
         output.parent.mkdir(parents=True, exist_ok=True)
-        header = scene.header(shot, number, resolved, render_seconds, frame.bounded_paths)
+        header = scene.header(shot, number, resolved, render_seconds, frame)
         frame.write(str(output), half=image.pixel_type == "half", header=header)
         seconds = time.monotonic() - begun
         self._display.note(f"frame {number}: {output}, {duration(seconds)}")
@@ -90,7 +90,7 @@ class Renderer:
             self._display.note(
                 f"frame {number}: {frame.bounded_paths} paths met the bound on work and were ended"
             )
-        if unmet:
+        if unmet := frame.unmet_buckets:
             self._display.note(
                 f"frame {number}: warning: {unmet} of its buckets have had all the samples they "
                 "may have and are not within the tolerance; raise sampling.samples"
@@ -111,11 +111,8 @@ class Renderer:
             "bounded_paths": frame.bounded_paths,
         }
 
-    def _watched(
-        self, index: int, number: int, volume: core.Volume
-    ) -> tuple[Resolved, core.Frame, int]:
-        """Renders with progress, and says how many buckets miss the tolerance; a Ctrl-C stops the
-        renderer's threads too."""
+    def _watched(self, index: int, number: int, volume: core.Volume) -> tuple[Resolved, core.Frame]:
+        """Renders with progress; a Ctrl-C stops the renderer's threads too."""
         control = core.Control()
         with ThreadPoolExecutor(1) as executor:
             future = executor.submit(self._render, number, volume, control)
@@ -131,7 +128,7 @@ class Renderer:
 
     def _render(
         self, number: int, volume: core.Volume, control: core.Control
-    ) -> tuple[Resolved, core.Frame, int]:
+    ) -> tuple[Resolved, core.Frame]:
         shot = self._shot
         self._pixels_done = 0
         resolved = deciding.resolve(
@@ -151,8 +148,7 @@ class Renderer:
             threads=self._threads,
             control=control,
         )
-        frame = sampler.whole(self._count)
-        return resolved, frame, sampler.unmet
+        return resolved, sampler.whole(self._count)
 
     def _count(self, pixels: int) -> None:
         self._pixels_done += pixels
