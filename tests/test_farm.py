@@ -84,6 +84,16 @@ def finish(client: Client, job: str) -> JobView:
     return view
 
 
+def rendered_here(shot: Shot, tmp_path: Path) -> list[dict[str, Any]]:
+    """What `pileus render` reports of each frame, rendered into the folder `here`."""
+    file = tmp_path / "shot.json"
+    file.write_text(shot.model_dump_json())
+    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
+    ended = subprocess.run(command, check=True, capture_output=True, text=True)
+    reports: list[dict[str, Any]] = json.loads(ended.stdout)["frames"]
+    return reports
+
+
 def test_the_farms_frames_equal_those_of_pileus_render(
     client: Client, real_shot: Shot, tmp_path: Path
 ) -> None:
@@ -92,11 +102,7 @@ def test_the_farms_frames_equal_those_of_pileus_render(
     assert view.frames_done == 3
     assert len({part.bucket for part in plan_of(tmp_path / "farm", job, 2).parts}) > 1
     assert any(part.samples[0] > 0 for part in plan_of(tmp_path / "farm", job, 2).parts)
-    file = tmp_path / "shot.json"
-    file.write_text(real_shot.model_dump_json())
-    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
-    ended = subprocess.run(command, check=True, capture_output=True, text=True)
-    reports = json.loads(ended.stdout)["frames"]
+    reports = rendered_here(real_shot, tmp_path)
     assert [report["frame"] for report in reports] == [1, 2, 3]
     for report in reports:
         same_bits(real_shot, tmp_path / "farm", job, report["frame"], tmp_path)
@@ -135,11 +141,7 @@ def test_auto_decides_and_samples_in_the_farm_as_here(
     )
     job = client.submit(shot).job.id
     finish(client, job)
-    file = tmp_path / "shot.json"
-    file.write_text(shot.model_dump_json())
-    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
-    ended = subprocess.run(command, check=True, capture_output=True, text=True)
-    reports = json.loads(ended.stdout)["frames"]
+    reports = rendered_here(shot, tmp_path)
     # What was taken is told, not what might have been.
     most = sum(report["samples"] + 0.5 for report in reports)
     assert 0 < client.job(job).samples <= most * shot.image.width * shot.image.height
@@ -160,11 +162,7 @@ def test_buckets_that_miss_the_tolerance_are_told(
     shot = real_shot.model_copy(update={"sampling": Sampling(samples=2, tolerance=1e-3)})
     job = client.submit(shot).job.id
     finish(client, job)
-    file = tmp_path / "shot.json"
-    file.write_text(shot.model_dump_json())
-    command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
-    ended = subprocess.run(command, check=True, capture_output=True, text=True)
-    here = [report["unmet_buckets"] for report in json.loads(ended.stdout)["frames"]]
+    here = [report["unmet_buckets"] for report in rendered_here(shot, tmp_path)]
     assert min(here) > 0
     assert [frame.unmet_buckets for frame in client.frames(job)] == here
 

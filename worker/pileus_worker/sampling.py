@@ -21,7 +21,8 @@ from pileus_worker import planning, scene
 EVEN = 0.1
 # From a round that is too short to know, not too far.
 GROWTH = 3
-# Of the frame's standard errors, what a bucket's smoothing has on top: 95 % are within as many.
+# What smoothing is said to leave has so many of the frame's standard errors on top: 95 % of frames
+# are within.
 MARGIN = 1.65
 # The buckets whose rounds go together, for threads wait for each other after each.
 TOGETHER = 64
@@ -72,13 +73,14 @@ class Sampler:
         count = 2 if self._shot.image.denoise and samples[1] > 1 else 1
         most = samples[1] // count
         growing = [[part] for part in self._render([(bucket, (0, 1)) for bucket in buckets])]
+        unsure = growing
         if count == 2:
             # One sample may do, which then needs no other half.
-            paired = [halves for halves in growing if self._wanted(halves) > 1]
-            first = [(halves[0].bucket, (0, 1)) for halves in paired]
-            for halves, other in zip(paired, self._render(first, half=1), strict=True):
+            unsure = [halves for halves in growing if self._wanted(halves) > 1]
+            first = [(halves[0].bucket, (0, 1)) for halves in unsure]
+            for halves, other in zip(unsure, self._render(first, half=1), strict=True):
                 halves.append(other)
-        pending = self._pending(growing, most)
+        pending = self._pending(unsure, most)
         while pending:
             ranges = [(halves[0].bucket, (_taken(halves), wanted)) for halves, wanted in pending]
             for number in range(count):

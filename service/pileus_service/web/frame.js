@@ -98,7 +98,7 @@ function showFacts(view) {
     Took: duration(view.seconds),
     File: view.file,
     Why: view.state === "done" ? "" : view.reason,
-    Noise: view.unmet_buckets ? `${view.unmet_buckets} buckets miss the tolerance` : "",
+    Noise: view.unmet_buckets ? `above the tolerance in ${view.unmet_buckets} of its buckets` : "",
   };
   const list = at("#frame dl");
   list.replaceChildren();
