@@ -1,5 +1,7 @@
 #include "direct_light.h"
 
+#include "local_step.h"
+
 #include <algorithm>
 #include <cmath>
 
@@ -92,11 +94,13 @@ DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
     : scene_(scene),
       schedule_(schedule),
       looks_(looks),
+      flights_(flights),
       tracked_(flights == Flights::tracked),
       all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
                                         [](const Look& look) { return look.physical(); })),
       asks_(!all_walk_ || std::any_of(scene.lights.begin(), scene.lights.end(), has_directions)),
-      reach_(tracked_ && std::any_of(scene.lights.begin(), scene.lights.end(), takes_bridges)
+      reach_(flights != Flights::other &&
+                     std::any_of(scene.lights.begin(), scene.lights.end(), takes_bridges)
                  ? bridge_length(scene.medium.phase().g())
                  : 0),
       early_(events_within(4.0f)),
@@ -240,41 +244,56 @@ const std::optional<Chain>& DirectLight::chain(Bridges& bridges, std::size_t lig
 }
 
 /// A bridge's flight from event n.
-Track DirectLight::flight(const V3f& position, const V3f& direction, int n, Random random) const {
+Bridges::Flight DirectLight::flight(const V3f& position, const V3f& direction, int n,
+                                    Random random) const {
     const Medium& medium = schedule_.onward(n);
+    LocalRay ray = medium.ray(position, direction);
+    bool aloft = true;
+    float distance = Track::none;
+    if (flights_ == Flights::local) {
+        float local = medium.extinction(position);
+        const bool inside = take_local_step(medium, ray, random.uniform(), local);
+        aloft = inside && local == 0.0f;  // where there is nothing it goes on by delta tracking
+        if (inside && !aloft) distance = 0.0f;
+    }
     const float first = random.uniform();
-    return {.medium = &medium,
-            .ray = medium.ray(position, direction),
-            .random = random,
-            .first = first};
+    return {{.medium = &medium, .ray = ray, .random = random, .first = first, .distance = distance},
+            aloft};
 }
 
 void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
     auto kept = bridges.under_way_.begin();
     for (Bridges::Bridge& bridge : bridges.under_way_) {
-        Track& flown = bridge.flight;
-        if (flown.distance == Track::none) continue;
+        if (go_on(bridge, rays)) *kept++ = bridge;
+    }
+    bridges.under_way_.erase(kept, bridges.under_way_.end());
+}
+
+/// Takes a bridge on as far as it comes without being tracked. Returns false at its end.
+bool DirectLight::go_on(Bridges::Bridge& bridge, ShadowRays& rays) const {
+    do {
+        Track& flown = bridge.flight.track;
+        if (flown.distance == Track::none) return false;
         const V3f position = flown.ray.at(flown.distance);
         bridge.weight *= flown.medium->albedo();
         const int n = ++bridge.n;
-        if (--bridge.left > 0) {
-            flown = flight(position, bridge.chain->first(bridge.left), n, flown.random);
-            *kept++ = bridge;
-            continue;
+        if (--bridge.left == 0) {
+            const LightSample& light = bridge.chain->light();
+            const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
+            const float u = flown.random.uniform();
+            ShadowRay ray(rays, schedule_.onward(n), position, light.direction,
+                          n < early_ ? 2.0f : 1.0f, u, flown.random);
+            for_terms(n, n + 1, [&](const Term& term) {
+                const float scattered =
+                    term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
+                ray.carry(term.look, term.order, term.power,
+                          bridge.weight * light.radiance * (term.weight * scattered));
+            });
+            return false;
         }
-        const LightSample& light = bridge.chain->light();
-        const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
-        const float u = flown.random.uniform();
-        ShadowRay ray(rays, schedule_.onward(n), position, light.direction,
-                      n < early_ ? 2.0f : 1.0f, u, flown.random);
-        for_terms(n, n + 1, [&](const Term& term) {
-            const float scattered =
-                term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
-            ray.carry(term.look, term.order, term.power,
-                      bridge.weight * light.radiance * (term.weight * scattered));
-        });
-    }
-    bridges.under_way_.erase(kept, bridges.under_way_.end());
+        bridge.flight = flight(position, bridge.chain->first(bridge.left), n, flown.random);
+    } while (!bridge.flight.aloft);
+    return true;
 }
 
 /// How many events of a walk come, on the mean, before it has gone so many transport mean free

@@ -50,13 +50,20 @@ class Bridges {
 
     bool empty() const { return under_way_.empty(); }
 
-    /// Lays their next flights down.
+    /// Lays their next flights down, but for those that have come to an end without being tracked.
     void cast(Tracker& tracker) {
-        for (Bridge& bridge : under_way_) tracker.add(Estimator::collision, bridge.flight);
+        for (Bridge& bridge : under_way_) {
+            if (bridge.flight.aloft) tracker.add(Estimator::collision, bridge.flight.track);
+        }
     }
 
   private:
     friend class DirectLight;
+
+    struct Flight {
+        Track track;
+        bool aloft;  // whether it is still to be tracked
+    };
 
     struct Bridge {
         const Chain* chain;
@@ -64,7 +71,7 @@ class Bridges {
         int left;            // flights to come, this one included
         Color weight;        // of the path up to that event
         float inverse_odds;  // of the chain's choices weighed with all others, and of being taken
-        Track flight;
+        Flight flight;
     };
 
     std::vector<std::optional<Chain>> chains_;  // by light
@@ -74,6 +81,7 @@ class Bridges {
 /// How a method flies from event to event.
 enum class Flights {
     tracked,  // delta tracking, unbiased
+    local,    // the talk's steps, by the extinction where they start
     other
 };
 
@@ -82,13 +90,13 @@ enum class Flights {
 ///   sigma_s b^i L p(w_i, w_o, c^i g) exp(-a^i integral of sigma_t to the light).
 /// Looks share the directions, and the shadow rays where they share the power a^i.
 ///
-/// Where flights are tracked, two more techniques find the same light with less noise:
-/// - the sky reaches a physical look (a = b = c = 1) by the walk itself as it leaves the medium, at
-///   no cost (`add_escape`);
-/// - distant lights are also reached by bridges (`add_bridges`). Of a path's last phase functions p
-///   one is then evaluated and the others sampled. Weighed by the balance heuristic (Veach 1997)
-///   every technique counts the same, the harmonic sum 1 / (sum of 1 / p): it has a peak only where
-///   all of them do.
+/// Two more techniques find the same light with less noise:
+/// - where flights are tracked, the sky reaches a physical look (a = b = c = 1) by the walk itself
+///   as it leaves the medium, at no cost (`add_escape`);
+/// - where they are tracked or local, distant lights are also reached by bridges (`ask_bridges`),
+///   which fly as the walk does. Of a path's last phase functions p one is then evaluated and the
+///   others sampled. Weighed by the balance heuristic (Veach 1997) every technique counts the same,
+///   the harmonic sum 1 / (sum of 1 / p): it has a peak only where all of them do.
 class DirectLight {
   public:
     DirectLight(const Scene& scene, const Schedule& schedule, const std::vector<Look>& looks,
@@ -139,11 +147,13 @@ class DirectLight {
     int events_within(float transport_lengths) const;
     const std::optional<Chain>& chain(Bridges& bridges, std::size_t light, int n,
                                       const PathRandom& random) const;
-    Track flight(const V3f& position, const V3f& direction, int n, Random random) const;
+    Bridges::Flight flight(const V3f& position, const V3f& direction, int n, Random random) const;
+    bool go_on(Bridges::Bridge& bridge, ShadowRays& rays) const;
 
     const Scene& scene_;
     const Schedule& schedule_;
     const std::vector<Look>& looks_;
+    Flights flights_;
     bool tracked_;
     bool all_walk_;
     bool asks_;  // whether any light is left to ask for at an event

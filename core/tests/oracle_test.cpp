@@ -239,6 +239,72 @@ TEST(Sky, ASmallBrightSpotIsTheSameByWalkAndByShadowRays) {
     }
 }
 
+/// A distant light that is taken for one that rays may meet (none does): there are no bridges to
+/// it.
+class WithoutBridges final : public Light {
+  public:
+    explicit WithoutBridges(std::shared_ptr<const Light> sun) : sun_(std::move(sun)) {}
+    std::optional<LightSample> sample(float u1, float u2) const override {
+        auto sample = sun_->sample(u1, u2);
+        if (sample) sample->density = 1e30f;  // beyond any phase function's
+        return sample;
+    }
+    float density(const V3f&) const override { return 0.0f; }
+    Color radiance(const V3f&) const override { return Color(0.0f); }
+    bool can_be_hit() const override { return true; }
+
+  private:
+    std::shared_ptr<const Light> sun_;
+};
+
+TEST(Bridges, BringTheLightOfEachOrderThatShadowRaysBring) {
+    // Lumps of all densities and hollows between them, where `multiple` flies now by the local
+    // extinction and now by tracking.
+    openvdb::initialize();
+    auto grid = openvdb::FloatGrid::create(0.0f);
+    Random random(3);
+    constexpr int lumps = 8, lump = 4;
+    for (int i = 0; i < lumps * lumps * lumps; ++i) {
+        const Coord low(i % lumps * lump, i / lumps % lumps * lump, i / (lumps * lumps) * lump);
+        const float density = random.uniform() - 0.4f;
+        if (density > 0.0f) grid->fill(openvdb::CoordBBox::createCube(low, lump), density);
+    }
+    grid->setTransform(openvdb::math::Transform::createLinearTransform(1.0 / (lumps * lump)));
+    const auto volume = test::volume_of(grid);
+    const Camera camera(V3d(0.5, 0.5, 3.0), V3d(0.5), V3d(0.0, 1.0, 0.0), 25.0);
+    const std::shared_ptr<const Light> sun =
+        make_distant_light(V3f(0.6f, -0.55f, -0.58f).normalized(), Color(3.0f), 1.0f);
+    constexpr int orders = 5;
+    const std::vector<Look> looks{{"physical"}, {"hero", 0.6f, 0.7f, 0.5f}};
+    for (const char* method : {"multiple", "reference"}) {
+        const auto seen = [&](std::shared_ptr<const Light> light, int samples) {
+            const Scene scene = test::make_scene(volume, camera, {std::move(light)},
+                                                 {30.0f, Color(0.7f, 0.9f, 1.0f), 0.6f, 48, 48});
+            return test::render_whole(scene, test::transport_of(method, orders, looks), samples,
+                                      true);
+        };
+        const Partial bridged = seen(sun, 128);
+        const Partial plain = seen(std::make_shared<WithoutBridges>(sun), 512);
+        for (std::size_t look = 0; look < looks.size(); ++look) {
+            for (std::size_t order = 0; order < orders; ++order) {
+                const std::size_t green = Partial::first_order + 3 * order + 1;
+                std::vector<double> gaps;
+                double mean = 0.0;
+                for (std::size_t i = 0; i < plain.image.window().pixels(); ++i) {
+                    const double other = plain.image.plane(look, green)[i];
+                    gaps.push_back(bridged.image.plane(look, green)[i] - other);
+                    mean += other / static_cast<double>(plain.image.window().pixels());
+                }
+                const auto [gap, error] = test::estimate(gaps);
+                EXPECT_NEAR(gap, 0.0, test::z_limit(confidence, 4 * orders) * error)
+                    << method << ", " << looks[look].name << ", order " << order;
+                EXPECT_LT(error, 0.008 * mean)
+                    << method << ", " << looks[look].name << ", order " << order;
+            }
+        }
+    }
+}
+
 TEST(Methods, AgreeWhereTheirModelsDo) {
     // In a homogeneous cube `density` and `multiple` model the same transport as `reference` with
     // as many orders; coloured albedo below 1, light scattered backwards, sun and sky.

@@ -7,6 +7,10 @@
 // direction and goes on by exact delta tracking to its next event. Where d is tiny but not 0 the
 // walk leaps, to the letter; that is the method's bias. A step out of the volume that meets nothing
 // more ends the path.
+//
+// Beyond the talk, bridges find the light of distant lights with less noise; they fly by the same
+// steps, so the mean is the talk's.
+#include "../local_step.h"
 #include "first_event.h"
 #include "methods.h"
 #include "walk.h"
@@ -21,7 +25,7 @@ class Multiple final : public Method {
         : scene_(scene),
           orders_(*transport.max_bounces),
           schedule_(scene.medium),
-          light_(scene, schedule_, transport.looks, Flights::other) {}
+          light_(scene, schedule_, transport.looks, Flights::local) {}
 
     Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
                PathKit& kit) override {
@@ -33,11 +37,7 @@ class Multiple final : public Method {
                        [&medium, local = 0.0f](LocalRay step, float u,
                                                Random&) mutable -> std::optional<NextEvent> {
                            if (local == 0.0f) local = medium.extinction(step.origin);
-                           if (local > 0.0f) {
-                               step.origin = step.at(exponential(u) / local);
-                               if (!medium.inside(step.origin)) return std::nullopt;
-                               local = medium.extinction(step.origin);
-                           }
+                           if (!take_local_step(medium, step, u, local)) return std::nullopt;
                            return NextEvent{step.origin, 1.0f, local == 0.0f};
                        });
     }

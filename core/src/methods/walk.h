@@ -22,12 +22,19 @@ Path walk_on(const Medium& medium, ScatterEvent event, int orders, const DirectL
              const PathRandom& random, Random walk, PathRecord& record, PathKit& kit, Next next) {
     for (int order = 0;; ++order) {
         light.ask(event, order, order + 1, random, kit.shadows);
-        kit.shadows.cast(kit.tracker);
-        co_await tracked;
-        kit.shadows.settle(record);
+        light.ask_bridges(event, order, orders, random, kit.bridges);
+        do {
+            kit.shadows.cast(kit.tracker);
+            kit.bridges.cast(kit.tracker);
+            co_await tracked;
+            kit.shadows.settle(record);
+            light.go_on(kit.bridges, kit.shadows);
+        } while (!kit.shadows.empty() || !kit.bridges.empty());
         if (order + 1 == orders) co_return;
         const auto [u1, u2, flown, shadow] = random.onward(order, walk);
-        event.direction = medium.phase().sample(event.direction, u1, u2).direction;
+        const auto turned = medium.phase().sample(event.direction, u1, u2);
+        event.direction = turned.direction;
+        event.choices.add(turned.inverse_density);
         const LocalRay onward = medium.ray(event.position, event.direction);
         const std::optional<NextEvent> found = next(onward, flown, walk);
         if (!found) co_return;
