@@ -65,19 +65,19 @@ void bind_render(nb::module_& m) {
     m.def(
         "render_parts",
         [](const Scene& scene, const Transport& transport,
-           const std::vector<std::pair<BucketTuple, RangeTuple>>& parts, std::uint64_t seed,
-           int frame, int orders, int threads, Control* control) {
+           const std::vector<std::tuple<BucketTuple, RangeTuple, std::uint64_t>>& parts, int frame,
+           int orders, int threads, Control* control) {
             Control own;
             std::vector<RenderTask> tasks;
-            for (const auto& [bucket, samples] : parts)
+            for (const auto& [bucket, samples, seed] : parts)
                 tasks.push_back({to_bucket(bucket), to_range(samples), seed, frame, orders});
             const nb::gil_scoped_release release;
             return render(scene, transport, tasks, threads, control ? *control : own);
         },
-        "scene"_a, "transport"_a, "parts"_a, nb::kw_only(), "seed"_a, "frame"_a, "orders"_a = 0,
+        "scene"_a, "transport"_a, "parts"_a, nb::kw_only(), "frame"_a, "orders"_a = 0,
         "threads"_a = 0, "control"_a.none() = nb::none(),
-        "Renders many pairs of a bucket and samples at once, to the bits that `render` makes of "
-        "each. Raises InputError, Cancelled.");
+        "Renders many parts, each of a bucket, samples and a seed, at once, to the bits that "
+        "`render` makes of each. Raises InputError, Cancelled.");
 }
 
 }  // namespace pileus::python

@@ -21,7 +21,7 @@ from pileus_worker import scene
 PILOT_PIXELS = 1024
 FEWEST_PIXELS = 128
 PILOT_SHARE = 0.02  # of the pixel samples that the frame seems to need
-DENOISED_SHARE = 0.125  # of that share, where the frame is denoised and will take far fewer
+DENOISED_SHARE = 0.0625  # of that share, where the frame is denoised and will take far fewer
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
 BLOCK = 4

@@ -69,23 +69,29 @@ class Sampler:
         What is to be denoised grows as two independent halves: they tell what smoothing leaves of
         its error, which is what the denoiser is trusted with (docs/denoising.md)."""
         if self._resolved.noise is None:
-            return self._render([(bucket, samples) for bucket in buckets])
+            return self._render([(bucket, samples, 0) for bucket in buckets])
         count = 2 if self._shot.image.denoise and samples[1] > 1 else 1
         most = samples[1] // count
-        growing = [[part] for part in self._render([(bucket, (0, 1)) for bucket in buckets])]
+        growing = [[part] for part in self._render([(bucket, (0, 1), 0) for bucket in buckets])]
         unsure = growing
         if count == 2:
             # One sample may do, which then needs no other half.
             unsure = [halves for halves in growing if self._wanted(halves) > 1]
-            first = [(halves[0].bucket, (0, 1)) for halves in unsure]
-            for halves, other in zip(unsure, self._render(first, half=1), strict=True):
+            first = [(halves[0].bucket, (0, 1), 1) for halves in unsure]
+            for halves, other in zip(unsure, self._render(first), strict=True):
                 halves.append(other)
         pending = self._pending(unsure, most)
         while pending:
-            ranges = [(halves[0].bucket, (_taken(halves), wanted)) for halves, wanted in pending]
-            for number in range(count):
-                for (halves, _), more in zip(pending, self._render(ranges, number), strict=True):
-                    halves[number].pool(more)
+            grown = [
+                (half, wanted, number)
+                for halves, wanted in pending
+                for number, half in enumerate(halves)
+            ]
+            more = self._render(
+                [(half.bucket, (half.samples[1], wanted), number) for half, wanted, number in grown]
+            )
+            for (half, *_), part in zip(grown, more, strict=True):
+                half.pool(part)
             pending = self._pending([halves for halves, _ in pending], most)
         for whole, *rest in growing:
             for half in rest:
@@ -130,15 +136,14 @@ class Sampler:
         share = (x1 - x0) * (y1 - y0) / (self._shot.image.width * self._shot.image.height)
         return min(1.0, MARGIN * math.sqrt(share))
 
-    def _render(
-        self, parts: list[tuple[Bucket, tuple[int, int]]], half: int = 0
-    ) -> list[core.Partial]:
+    def _render(self, parts: list[tuple[Bucket, tuple[int, int], int]]) -> list[core.Partial]:
+        """Each part a bucket, samples and the half that they are of."""
+        seed = self._shot.sampling.seed
         return core.render_parts(
             self._view,
             self._transport,
-            parts,
             # No shot has a seed of so many bits.
-            seed=self._shot.sampling.seed + (half << 32),
+            [(bucket, samples, seed + (half << 32)) for bucket, samples, half in parts],
             frame=self._frame,
             orders=self._orders,
             threads=self._threads,
