@@ -9,7 +9,7 @@ import pileus_core as core
 import pytest
 
 from pileus_bench.contenders import PEERS, methods
-from pileus_bench.measures import Truth, errors
+from pileus_bench.measures import Truth, errors, relative_noise
 from pileus_bench.run import Measurement, Plan
 from pileus_bench.scenes import AbsentError, dense, load_scene, scene_names
 from pileus_service.shotfile import load_shot
@@ -43,6 +43,18 @@ def test_bias_and_noise_are_told_apart_whatever_the_truths_own_noise(
     assert found.rel_mse.value == pytest.approx(found.noise + found.bias.value, rel=0.05)
     assert (found.bias.low > 0) == (bias > 0)
     assert found.mean_ratio == pytest.approx(1 + bias, abs=4 * found.mean_ratio_error)
+
+
+def test_a_method_has_no_less_noise_for_being_darker() -> None:
+    random = np.random.default_rng(9)
+    exact = random.uniform(0.0, 1.0, (100, 100, 1)).repeat(3, axis=2)
+    renders = [exact * (1 + 0.1 * random.standard_normal(exact.shape)) for _ in range(3)]
+    dark = [render / 40 for render in renders]
+    truth = Truth(exact, exact)
+    assert relative_noise(dark, truth) == pytest.approx(relative_noise(renders, truth))
+    assert relative_noise(renders, truth) == pytest.approx(
+        errors([(renders, truth)]).noise, rel=0.1
+    )
 
 
 def test_a_few_fireflies_do_not_decide() -> None:

@@ -99,9 +99,12 @@ def _reference(points: Sequence[Point], unit: str, of: Callable[[Point], float])
 
 
 def _multiple(points: Sequence[Point]) -> Bar:
-    """Core seconds to equal noise, each method's noise relative to its own mean image."""
+    """Core seconds to equal noise, each method's noise relative to its own mean image and both
+    exposed alike."""
     return _against_single(
-        points, "multiple at 16 orders against single, time at equal noise", _noise_seconds
+        points,
+        "multiple at 16 orders against single, both exposed alike, time at equal noise",
+        _noise_seconds,
     )
 
 
@@ -116,8 +119,8 @@ def _multiple_to_target(points: Sequence[Point]) -> Bar:
 
     return _against_single(
         points,
-        f"multiple at 16 orders against single, time to a noise of {TARGET:g}, a sample a pixel or "
-        "more",
+        f"multiple at 16 orders against single, both exposed alike, time to a noise of {TARGET:g}, "
+        "a sample a pixel or more",
         to_target,
     )
 

@@ -90,9 +90,12 @@ def trimmed_error(image: Image, truth: Truth) -> float:
     return float(np.mean(_trim([image], truth)))
 
 
-def relative_noise(images: Sequence[Image]) -> float:
-    """The repeats' variance relative to their own mean: what methods of different truths share."""
+def relative_noise(images: Sequence[Image], truth: Truth) -> float:
+    """The repeats' variance relative to their own mean, each exposed to be as bright as the truth
+    is: what methods of different truths share. Without that the least that the relMSE takes for
+    bright would count one that leaves out most of the light as free of noise."""
     stack = np.stack(images)
+    stack *= truth.mean.mean() / stack.mean()
     return float(np.mean(np.var(stack, axis=0, ddof=1) / (stack.mean(axis=0) ** 2 + 0.01)))
 
 

@@ -205,7 +205,9 @@ def _point(
         rel_mse=found.rel_mse,
         trimmed=found.trimmed,
         noise=found.noise,
-        own_noise=mean(relative_noise(images) for images in run.images),
+        own_noise=mean(
+            relative_noise(images, truth) for images, truth in zip(run.images, truths, strict=True)
+        ),
         bias=found.bias,
         mean_ratio=found.mean_ratio,
         mean_ratio_error=found.mean_ratio_error,

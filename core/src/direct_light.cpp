@@ -95,9 +95,9 @@ DirectLight::DirectLight(const Scene& scene, const Schedule& schedule,
       schedule_(schedule),
       looks_(looks),
       flights_(flights),
-      tracked_(flights == Flights::tracked),
-      all_walk_(tracked_ && std::all_of(looks.begin(), looks.end(),
-                                        [](const Look& look) { return look.physical(); })),
+      all_walk_(flights == Flights::tracked &&
+                std::all_of(looks.begin(), looks.end(),
+                            [](const Look& look) { return look.physical(); })),
       asks_(!all_walk_ || std::any_of(scene.lights.begin(), scene.lights.end(), has_directions)),
       reach_(flights != Flights::other &&
                      std::any_of(scene.lights.begin(), scene.lights.end(), takes_bridges)
@@ -120,7 +120,7 @@ DirectLight::Term DirectLight::make_term(std::size_t look, int n) const {
     };
     return {look,           order,
             power(given.b), HenyeyGreenstein(power(given.c) * schedule_.at(n).phase().g()),
-            power(given.a), tracked_ && given.physical()};
+            power(given.a), flights_ == Flights::tracked && given.physical()};
 }
 
 void DirectLight::ask(const ScatterEvent& event, int first, int last, const PathRandom& random,
@@ -304,7 +304,7 @@ int DirectLight::events_within(float transport_lengths) const {
 
 void DirectLight::add_escape(const ScatterEvent& event, const V3f& direction, float inverse_density,
                              int n, PathRecord& record) const {
-    if (!tracked_) return;
+    if (flights_ != Flights::tracked) return;
     const int order = schedule_.order(n);
     for (const auto& light : scene_.lights) {
         if (!light->can_be_hit()) continue;

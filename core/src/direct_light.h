@@ -154,7 +154,6 @@ class DirectLight {
     const Schedule& schedule_;
     const std::vector<Look>& looks_;
     Flights flights_;
-    bool tracked_;
     bool all_walk_;
     bool asks_;  // whether any light is left to ask for at an event
     int reach_;  // the most events of a bridge; 0 where there are none
