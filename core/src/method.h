@@ -15,6 +15,21 @@ namespace pileus {
 /// What a path in flight works with; the next path takes it over.
 struct PathKit {
     PathKit(Tracker& with, std::size_t lights) : tracker(with), bridges(lights) {}
+
+    /// Lays down the rays of the light that was asked for.
+    void cast() {
+        shadows.cast(tracker);
+        bridges.cast(tracker);
+    }
+
+    /// Once they have been tracked, adds what has come through. Returns whether further ones are to
+    /// be cast.
+    bool settle(const DirectLight& light, PathRecord& record) {
+        shadows.settle(record);
+        light.go_on(bridges, shadows);
+        return !shadows.empty() || !bridges.empty();
+    }
+
     Tracker& tracker;
     ShadowRays shadows;
     Bridges bridges;

@@ -24,14 +24,13 @@ class Tracked final : public Method {
 
     Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
                PathKit& kit) override {
-        auto& [tracker, shadows, bridges] = kit;
         Random walk = random.stream(walk_stream);
         Track camera{.medium = &scene_.medium,
                      .ray = *ray.volume,
                      .random = walk,
                      .first = random.first[2],
                      .rate = first_rate_};
-        tracker.add(Estimator::forced_collision, camera);
+        kit.tracker.add(Estimator::forced_collision, camera);
         co_await tracked;
         walk = camera.random;
         const float opacity = seldom(camera.weight, walk);
@@ -41,8 +40,8 @@ class Tracked final : public Method {
         ScatterEvent event{ray.volume->at(camera.distance), ray.direction,
                            scene_.medium.albedo() * opacity};
         for (int n = 0;; ++n) {
-            light_.ask(event, n, n + 1, random, shadows);
-            light_.ask_bridges(event, n, events_, random, bridges);
+            light_.ask(event, n, n + 1, random, kit.shadows);
+            light_.ask_bridges(event, n, events_, random, kit.bridges);
             const auto [u1, u2, flown, shadow] = random.onward(n, walk);
             const Medium& medium = schedule_.onward(n);
             Turn turn{&schedule_.at(n).phase(), event.direction, u1, u2};
@@ -50,14 +49,11 @@ class Tracked final : public Method {
                          .ray = {event.position, V3f(0.0f)},
                          .random = walk,
                          .first = flown};
-            tracker.add(turn, flight);
+            kit.tracker.add(turn, flight);
             do {
-                shadows.cast(tracker);
-                bridges.cast(tracker);
+                kit.cast();
                 co_await tracked;
-                shadows.settle(record);
-                light_.go_on(bridges, shadows);
-            } while (!shadows.empty() || !bridges.empty());
+            } while (kit.settle(light_, record));
             const auto& [direction, inverse_density] = turn.onward;
             if (flight.distance == Track::none) {
                 light_.add_escape(event, direction, inverse_density, n, record);

@@ -24,12 +24,9 @@ Path walk_on(const Medium& medium, ScatterEvent event, int orders, const DirectL
         light.ask(event, order, order + 1, random, kit.shadows);
         light.ask_bridges(event, order, orders, random, kit.bridges);
         do {
-            kit.shadows.cast(kit.tracker);
-            kit.bridges.cast(kit.tracker);
+            kit.cast();
             co_await tracked;
-            kit.shadows.settle(record);
-            light.go_on(kit.bridges, kit.shadows);
-        } while (!kit.shadows.empty() || !kit.bridges.empty());
+        } while (kit.settle(light, record));
         if (order + 1 == orders) co_return;
         const auto [u1, u2, flown, shadow] = random.onward(order, walk);
         const auto turned = medium.phase().sample(event.direction, u1, u2);
