@@ -43,6 +43,7 @@ class Agreement:
         """Called each second: looks at the jobs that have changed since; at all of them at first,
         when Redis cannot tell, and as time passes."""
         mark, changed = self._queue.changed(self._seen)
+        self._seen = None  # a look that is cut short is followed by one at all
         now = time.monotonic()
         if changed is None or now - self._compared >= COMPARE_ALL:
             self._compare_all()
