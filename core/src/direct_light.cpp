@@ -1,7 +1,5 @@
 #include "direct_light.h"
 
-#include "local_step.h"
-
 #include <algorithm>
 #include <cmath>
 
@@ -217,9 +215,9 @@ void DirectLight::ask_bridges(const ScatterEvent& event, int n, int end, const P
             until_taken -= odds;
             if (until_taken >= 0.0f) continue;
             until_taken += 1.0f;
-            bridges.under_way_.push_back(
-                {&*way, n, length, event.weight, inverse * odds,
-                 flight(event.position, way->first(length), n, Random(event_stream.bits()))});
+            bridges.under_way_.push_back({&*way, n, length, event.weight, inverse * odds,
+                                          flight(event.position, way->first(length), n,
+                                                 Random(event_stream.bits()), event.local)});
         }
     }
 }
@@ -244,21 +242,21 @@ const std::optional<Chain>& DirectLight::chain(Bridges& bridges, std::size_t lig
 }
 
 /// A bridge's flight from event n.
-Bridges::Flight DirectLight::flight(const V3f& position, const V3f& direction, int n,
-                                    Random random) const {
+Track DirectLight::flight(const V3f& position, const V3f& direction, int n, Random random,
+                          float local) const {
     const Medium& medium = schedule_.onward(n);
-    LocalRay ray = medium.ray(position, direction);
-    bool aloft = true;
-    float distance = Track::none;
-    if (flights_ == Flights::local) {
-        float local = medium.extinction(position);
-        const bool inside = take_local_step(medium, ray, random.uniform(), local);
-        aloft = inside && local == 0.0f;  // where there is nothing it goes on by delta tracking
-        if (inside && !aloft) distance = 0.0f;
-    }
     const float first = random.uniform();
-    return {{.medium = &medium, .ray = ray, .random = random, .first = first, .distance = distance},
-            aloft};
+    return {.medium = &medium,
+            .ray = medium.ray(position, direction),
+            .random = random,
+            .first = first,
+            .local = local};
+}
+
+void DirectLight::cast(Bridges& bridges, Tracker& tracker) const {
+    const auto estimator =
+        flights_ == Flights::local ? Estimator::local_step : Estimator::collision;
+    for (Bridges::Bridge& bridge : bridges.under_way_) tracker.add(estimator, bridge.flight);
 }
 
 void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
@@ -269,31 +267,30 @@ void DirectLight::go_on(Bridges& bridges, ShadowRays& rays) const {
     bridges.under_way_.erase(kept, bridges.under_way_.end());
 }
 
-/// Takes a bridge on as far as it comes without being tracked. Returns false at its end.
+/// Takes a bridge on to its next flight. Returns false at its end.
 bool DirectLight::go_on(Bridges::Bridge& bridge, ShadowRays& rays) const {
-    do {
-        Track& flown = bridge.flight.track;
-        if (flown.distance == Track::none) return false;
-        const V3f position = flown.ray.at(flown.distance);
-        bridge.weight *= flown.medium->albedo();
-        const int n = ++bridge.n;
-        if (--bridge.left == 0) {
-            const LightSample& light = bridge.chain->light();
-            const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
-            const float u = flown.random.uniform();
-            ShadowRay ray(rays, schedule_.onward(n), position, light.direction,
-                          n < early_ ? 2.0f : 1.0f, u, flown.random);
-            for_terms(n, n + 1, [&](const Term& term) {
-                const float scattered =
-                    term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
-                ray.carry(term.look, term.order, term.power,
-                          bridge.weight * light.radiance * (term.weight * scattered));
-            });
-            return false;
-        }
-        bridge.flight = flight(position, bridge.chain->first(bridge.left), n, flown.random);
-    } while (!bridge.flight.aloft);
-    return true;
+    const Track& flown = bridge.flight;
+    if (flown.distance == Track::none) return false;
+    const V3f position = flown.ray.at(flown.distance);
+    Random random = flown.random;
+    bridge.weight *= flown.medium->albedo();
+    const int n = ++bridge.n;
+    if (--bridge.left > 0) {
+        bridge.flight = flight(position, bridge.chain->first(bridge.left), n, random, flown.local);
+        return true;
+    }
+    const LightSample& light = bridge.chain->light();
+    const float inverse_odds = bridge.inverse_odds / bridge.chain->inverse(1);
+    const float u = random.uniform();
+    ShadowRay ray(rays, schedule_.onward(n), position, light.direction, n < early_ ? 2.0f : 1.0f, u,
+                  random);
+    for_terms(n, n + 1, [&](const Term& term) {
+        const float scattered =
+            term.phase.density(bridge.chain->first(1), light.direction) / inverse_odds;
+        ray.carry(term.look, term.order, term.power,
+                  bridge.weight * light.radiance * (term.weight * scattered));
+    });
+    return false;
 }
 
 /// How many events of a walk come, on the mean, before it has gone so many transport mean free

@@ -50,20 +50,8 @@ class Bridges {
 
     bool empty() const { return under_way_.empty(); }
 
-    /// Lays their next flights down, but for those that have come to an end without being tracked.
-    void cast(Tracker& tracker) {
-        for (Bridge& bridge : under_way_) {
-            if (bridge.flight.aloft) tracker.add(Estimator::collision, bridge.flight.track);
-        }
-    }
-
   private:
     friend class DirectLight;
-
-    struct Flight {
-        Track track;
-        bool aloft;  // whether it is still to be tracked
-    };
 
     struct Bridge {
         const Chain* chain;
@@ -71,7 +59,7 @@ class Bridges {
         int left;            // flights to come, this one included
         Color weight;        // of the path up to that event
         float inverse_odds;  // of the chain's choices weighed with all others, and of being taken
-        Flight flight;
+        Track flight;
     };
 
     std::vector<std::optional<Chain>> chains_;  // by light
@@ -111,6 +99,9 @@ class DirectLight {
     void ask_bridges(const ScatterEvent& event, int n, int end, const PathRandom& random,
                      Bridges& bridges) const;
 
+    /// Lays down the next flights of bridges.
+    void cast(Bridges& bridges, Tracker& tracker) const;
+
     /// Takes bridges on to their next flights, once the last ones have been tracked, and asks for
     /// the light at the ends of those that have arrived.
     void go_on(Bridges& bridges, ShadowRays& rays) const;
@@ -147,7 +138,8 @@ class DirectLight {
     int events_within(float transport_lengths) const;
     const std::optional<Chain>& chain(Bridges& bridges, std::size_t light, int n,
                                       const PathRandom& random) const;
-    Bridges::Flight flight(const V3f& position, const V3f& direction, int n, Random random) const;
+    Track flight(const V3f& position, const V3f& direction, int n, Random random,
+                 float local) const;
     bool go_on(Bridges::Bridge& bridge, ShadowRays& rays) const;
 
     const Scene& scene_;

@@ -17,9 +17,9 @@ struct PathKit {
     PathKit(Tracker& with, std::size_t lights) : tracker(with), bridges(lights) {}
 
     /// Lays down the rays of the light that was asked for.
-    void cast() {
+    void cast(const DirectLight& light) {
         shadows.cast(tracker);
-        bridges.cast(tracker);
+        light.cast(bridges, tracker);
     }
 
     /// Once they have been tracked, adds what has come through. Returns whether further ones are to

@@ -121,6 +121,7 @@ struct ScatterEvent {
     V3f direction;            // world, unit: the way the walk arrived
     Color weight;             // of the path up to here, this event's albedo included
     RecentChoices choices{};  // of the directions up to here
+    float local = -1.0f;      // the extinction here, where a local step has led here
     float shadow = 0.0f;      // the number for its shadow, where it is not the first
 };
 

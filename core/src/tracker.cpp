@@ -81,11 +81,10 @@ Tracker::Tracker(const BrickTree& tree, Boxes boxes, int width)
 }
 
 void Tracker::run() {
-    // Those that turn lie side by side, so that they turn together.
-    auto& flights = waiting_[static_cast<std::size_t>(Estimator::collision)];
-    flights.insert(flights.begin(), turning_.begin(), turning_.end());
-    turning_.clear();
     for (std::size_t i = 0; i < waiting_.size(); ++i) {
+        // Those that turn lie side by side, so that they turn together.
+        waiting_[i].insert(waiting_[i].begin(), turning_[i].begin(), turning_[i].end());
+        turning_[i].clear();
         if (waiting_[i].empty()) continue;
         follow_(static_cast<Estimator>(i), *tree_, boxes_, waiting_[i]);
         waiting_[i].clear();

@@ -17,6 +17,12 @@ enum class Estimator {
     /// Delta tracking: the distance to the next true collision, distributed as transmittance times
     /// extinction.
     collision,
+    /// The talk's step (Wrenninge 2015), through a medium that is taken to be everywhere as dense
+    /// as
+    /// where the step starts: Woodcock tracking with the majorant approximated by the local
+    /// extinction. The ray's origin, which lies in the medium's box, moves to the step's end. From
+    /// where there is no density it goes on as in delta tracking.
+    local_step,
     /// Weighted delta tracking (Novak et al. 2018): at each tentative collision a part of the
     /// weight collides and the rest goes on. One of the collisions is kept, drawn by its part.
     /// Light and opacity where the medium is thin are then no longer a matter of all or nothing.
@@ -46,6 +52,7 @@ struct Track {
     Turn* turn = nullptr;  // of which the ray's direction comes, if there is one
     Random random;         // goes on where tracking has left it
     float first;           // of which the first free flight is drawn, uniform in [0, 1)
+    float local = -1.0f;   // the extinction at the ray's origin; below 0 where it is not known
     float power = 1.0f;    // of the transmittance
     float rate = 1.0f;     // of collisions, over the majorant; at least 1. More of them, less noise
     float distance = none;  // of the collision; none where the ray leaves the medium
@@ -68,11 +75,11 @@ class Tracker {
         waiting_[static_cast<std::size_t>(estimator)].push_back(&track);
     }
 
-    /// The same for a flight to the next collision, in a direction that is drawn. The turn, too,
-    /// must stay.
-    void add(Turn& turn, Track& flight) {
+    /// The same for a flight to the next event, in a direction that is drawn. The turn, too, must
+    /// stay.
+    void add(Estimator estimator, Turn& turn, Track& flight) {
         flight.turn = &turn;
-        turning_.push_back(&flight);
+        turning_[static_cast<std::size_t>(estimator)].push_back(&flight);
     }
 
     /// Follows all rays that were laid down. What is found along one does not depend on the others,
@@ -82,9 +89,8 @@ class Tracker {
   private:
     const BrickTree* tree_;
     Boxes boxes_;
-    void (*follow_)(Estimator, const BrickTree&, Boxes, std::span<Track* const>);
-    std::array<std::vector<Track*>, 3> waiting_;  // by estimator
-    std::vector<Track*> turning_;
+    void (*follow_)(Estimator, const BrickTree&, Boxes, std::span<Track*>);
+    std::array<std::vector<Track*>, 4> waiting_, turning_;  // by estimator
 };
 
 }  // namespace pileus

@@ -238,6 +238,58 @@ TEST_P(TrackerTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
     }
 }
 
+TEST_P(TrackerTest, LocalStepsAreThoseOfTheExtinctionWhereTheyStart) {
+    // From anywhere in the box, a tenth of it being empty and some of it filled throughout.
+    const V3d low(volume_->tree().low()), size = V3d(volume_->tree().high()) - low;
+    std::vector<Track> from;
+    for (std::size_t i = 0; i < 3000; ++i) {
+        Random random(hash_key(3, i));
+        const auto unit = [&] { return double{random.uniform()}; };
+        const V3f position(low + V3d(unit(), unit(), unit()) * size);
+        const V3f towards(V3d(unit(), unit(), unit()) - V3d(0.5));
+        Track track = along(*medium_, medium_->ray(position, towards.normalized()));
+        track.first = i % 50 == 0 ? 0.0f : random.uniform();
+        track.random = random;
+        if (i % 3 == 0) track.local = medium_->extinction(position);
+        from.push_back(track);
+    }
+    for (const int width : Tracker::widths()) {
+        std::vector<Track> found = from;
+        Tracker tracker(volume_->tree(), GetParam(), width);
+        for (Track& track : found) tracker.add(Estimator::local_step, track);
+        tracker.run();
+        int met = 0, left = 0, flown = 0;
+        for (std::size_t i = 0; i < from.size(); ++i) {
+            Track expected = from[i];
+            const float local = medium_->extinction(expected.ray.origin);
+            if (local > 0.0f)
+                expected.ray.origin = expected.ray.at(-std::log(1.0f - expected.first) / local);
+            const V3f end = expected.ray.origin;
+            if (!medium_->inside(end)) {
+                ++left;
+                EXPECT_EQ(found[i].distance, Track::none) << i;
+                continue;
+            }
+            const float there = medium_->extinction(end);
+            EXPECT_LT((found[i].ray.origin - end).length(), 1e-5f * (1.0f + end.length())) << i;
+            if (there > 0.0f) {
+                ++met;
+                EXPECT_EQ(found[i].distance, 0.0f) << i;
+                EXPECT_NEAR(found[i].local, there, 1e-4f) << i;
+                continue;
+            }
+            ++flown;
+            expected.ray.origin = found[i].ray.origin;
+            expected.first = expected.random.uniform();
+            tracker.add(Estimator::collision, expected);
+            tracker.run();
+            EXPECT_EQ(found[i].distance, expected.distance) << i;
+            EXPECT_LT(found[i].local, 0.0f);
+        }
+        EXPECT_GT(std::min({met, left, flown}), 100);
+    }
+}
+
 TEST_F(TrackingTest, RaysTurnAsThePhaseFunctionDoesAlone) {
     // Also along the axes, where the frame's formulas have their corners.
     std::vector<V3f> ways = {V3f(0, 0, 1), V3f(0, 0, -1), V3f(1, 0, 0), V3f(0, -1, 0)};
@@ -264,7 +316,7 @@ TEST_F(TrackingTest, RaysTurnAsThePhaseFunctionDoesAlone) {
             for (std::size_t i = 0; i < ways.size(); ++i) {
                 straight[i].ray.direction = ways[i];
                 tracker.add(Estimator::collision, straight[i]);
-                tracker.add(turns[i], turning[i]);
+                tracker.add(Estimator::collision, turns[i], turning[i]);
             }
             tracker.run();
             for (std::size_t i = 0; i < ways.size(); ++i) {

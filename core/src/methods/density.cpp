@@ -2,7 +2,6 @@
 // Accurate to the march's step, and dear.
 #include "first_event.h"
 #include "methods.h"
-#include "walk.h"
 
 namespace pileus {
 
@@ -20,15 +19,24 @@ class Density final : public Method {
                PathKit& kit) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
-        const auto event = first_event(scene_, ray, random, walk, march_, record);
-        if (!event) return {};
-        return walk_on(
-            medium, *event, orders_, light_, random, walk, record, kit,
-            [this](const LocalRay& onward, float u, Random& numbers) -> std::optional<NextEvent> {
-                march_.march(scene_.medium, onward, numbers.uniform());
-                if (march_.opacity() <= 0.0f) return std::nullopt;
-                return NextEvent{onward.at(march_.invert(u)), march_.opacity()};
-            });
+        auto event = first_event(scene_, ray, random, walk, march_, record);
+        if (!event) co_return;
+        for (int order = 0;; ++order) {
+            light_.ask(*event, order, order + 1, random, kit.shadows);
+            kit.shadows.cast(kit.tracker);
+            co_await tracked;
+            kit.shadows.settle(record);
+            if (order + 1 == orders_) co_return;
+            const auto [u1, u2, flown, shadow] = random.onward(order, walk);
+            event->direction = medium.phase().sample(event->direction, u1, u2).direction;
+            const LocalRay onward = medium.ray(event->position, event->direction);
+            march_.march(medium, onward, walk.uniform());
+            if (march_.opacity() <= 0.0f) co_return;
+            event->position = onward.at(march_.invert(flown));
+            event->shadow = shadow;
+            event->weight *= medium.albedo() * march_.opacity();
+            if (event->weight == Color(0.0f)) co_return;
+        }
     }
 
   private:

@@ -10,10 +10,8 @@
 //
 // Beyond the talk, bridges find the light of distant lights with less noise; they fly by the same
 // steps, so the mean is the talk's.
-#include "../local_step.h"
 #include "first_event.h"
 #include "methods.h"
-#include "walk.h"
 
 namespace pileus {
 
@@ -31,15 +29,34 @@ class Multiple final : public Method {
                PathKit& kit) override {
         const Medium& medium = scene_.medium;
         Random walk = random.stream(walk_stream);
-        const auto event = first_event(scene_, ray, random, walk, march_, record);
-        if (!event) return {};
-        return walk_on(medium, *event, orders_, light_, random, walk, record, kit,
-                       [&medium, local = 0.0f](LocalRay step, float u,
-                                               Random&) mutable -> std::optional<NextEvent> {
-                           if (local == 0.0f) local = medium.extinction(step.origin);
-                           if (!take_local_step(medium, step, u, local)) return std::nullopt;
-                           return NextEvent{step.origin, 1.0f, local == 0.0f};
-                       });
+        auto event = first_event(scene_, ray, random, walk, march_, record);
+        if (!event) co_return;
+        for (int order = 0;; ++order) {
+            light_.ask(*event, order, order + 1, random, kit.shadows);
+            light_.ask_bridges(*event, order, orders_, random, kit.bridges);
+            const bool last = order + 1 == orders_;
+            const auto [u1, u2, flown, shadow] = random.onward(order, walk);
+            Turn turn{&medium.phase(), event->direction, u1, u2};
+            Track flight{.medium = &medium,
+                         .ray = {event->position, V3f(0.0f)},
+                         .random = walk,
+                         .first = flown,
+                         .local = event->local};
+            if (!last) kit.tracker.add(Estimator::local_step, turn, flight);
+            do {
+                kit.cast(light_);
+                co_await tracked;
+            } while (kit.settle(light_, record));
+            if (last || flight.distance == Track::none) co_return;
+            walk = flight.random;
+            event->position = flight.ray.at(flight.distance);
+            event->local = flight.local;
+            event->direction = turn.onward.direction;
+            event->weight *= medium.albedo();
+            event->choices.add(turn.onward.inverse_density);
+            event->shadow = shadow;
+            if (event->weight == Color(0.0f)) co_return;
+        }
     }
 
   private:

@@ -49,9 +49,9 @@ class Tracked final : public Method {
                          .ray = {event.position, V3f(0.0f)},
                          .random = walk,
                          .first = flown};
-            kit.tracker.add(turn, flight);
+            kit.tracker.add(Estimator::collision, turn, flight);
             do {
-                kit.cast();
+                kit.cast(light_);
                 co_await tracked;
             } while (kit.settle(light_, record));
             const auto& [direction, inverse_density] = turn.onward;
