@@ -36,6 +36,17 @@ class PathRandom {
     /// The pixel's x and y, the distance to the first event, and there the choice of lobe.
     const Point first;
 
+    /// Those of walk `k` of so many that go on from the first event: among all walks of the pixel's
+    /// samples they are as stratified as those of its samples.
+    PathRandom walk(int k, int walks) const {
+        PathRandom numbers = *this;
+        numbers.sample_ =
+            sample_ * static_cast<std::uint32_t>(walks) + static_cast<std::uint32_t>(k);
+        numbers.key_ = hash_key(key_, walk_keys + static_cast<std::uint64_t>(k));
+        numbers.light_.reset();
+        return numbers;
+    }
+
     /// At the first event: the direction towards a light, the shadow ray's first flight, and the
     /// choice of bridges. Many paths have none.
     const Point& light() const {
@@ -70,6 +81,9 @@ class PathRandom {
     static constexpr std::uint64_t camera_points = 1ULL << 32, light_points = camera_points + 1,
                                    chain_points = camera_points + 2,
                                    walk_points = camera_points + 3;
+
+    // A walk's key is a sample's, beyond all its streams.
+    static constexpr std::uint64_t walk_keys = 1ULL << 32;
 
     Point stratified(std::uint64_t sequence) const {
         return sobol::point(sample_, hash_key(pixel_key_, sequence));

@@ -53,6 +53,21 @@ TEST(Sobol, EachDimensionIsStratified) {
     }
 }
 
+TEST(Sobol, WalksOfAPixelAreStratifiedTogether) {
+    constexpr int samples = 128, walks = 2, count = samples * walks;
+    std::vector<int> first(count), light(count);
+    for (std::uint32_t sample = 0; sample < samples; ++sample) {
+        for (int k = 0; k < walks; ++k) {
+            const PathRandom numbers = PathRandom(hash_key(5, 7), sample).walk(k, walks);
+            Random unused(0);
+            ++first[static_cast<std::size_t>(numbers.onward(0, unused)[0] * count)];
+            ++light[static_cast<std::size_t>(numbers.light()[3] * count)];
+        }
+    }
+    EXPECT_EQ(*std::max_element(first.begin(), first.end()), 1);
+    EXPECT_EQ(*std::max_element(light.begin(), light.end()), 1);
+}
+
 /// A chi-square test of pairs against the uniform square.
 void expect_uniform_square(const std::vector<std::pair<float, float>>& pairs, int tests) {
     constexpr unsigned side = 16;
