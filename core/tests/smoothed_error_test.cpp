@@ -103,6 +103,18 @@ TEST(SmoothedError, HasItsMarginOnTop) {
     EXPECT_GT(smoothed_error(half, other, 1.0), smoothed_error(half, other, 0.5));
 }
 
+TEST(SmoothedError, OfFewBlocksIsNeverNoneByChance) {
+    const Truth flat = [](int, int) { return 1.0; };
+    constexpr double variance = 0.1;
+    const double least = variance / 2.0 / 81.0 / 1.01;  // of the mean of both halves
+    for (std::uint64_t seed = 0; seed < 200; ++seed) {
+        const Partial half = noisy(24, flat, variance, 2 * seed),
+                      other = noisy(24, flat, variance, 2 * seed + 1);
+        // 576 pixels tell their variance to a twentieth.
+        EXPECT_GT(smoothed_error(half, other, 0.0), std::sqrt(0.7 * least)) << seed;
+    }
+}
+
 TEST(SmoothedError, IsUnknownOfFewPixelsAndRefusedForUnlikeBuckets) {
     const Truth flat = [](int, int) { return 1.0; };
     const Partial small = noisy(23, flat, 0.1, 1), half = noisy(24, flat, 0.1, 1);
