@@ -9,8 +9,9 @@ DEBIAN := redis-server cmake ninja-build g++ ccache libopenvdb-dev libboost-dev 
 	clang-format pkg-config python3-venv python3-dev
 # What the slow tests alone ask for: a browser, a Slurm cluster, containers, a systemd of its own,
 # OpenVDB's writer of odd caches, and Clang's fuzzer.
-SLOW := clang libclang-rt-dev chromium prometheus slurmctld slurmd slurm-client munge buildah debootstrap systemd \
-	systemd-container openssl python3-openvdb podman podman-compose crun netavark aardvark-dns iptables
+SLOW := clang libclang-rt-dev chromium prometheus slurmctld slurmd slurm-client munge buildah \
+	debootstrap systemd systemd-container openssl python3-openvdb podman podman-compose crun netavark \
+	aardvark-dns iptables
 CORE := $(shell find core -type f -not -path '*/build/*' -not -name '*.pyc')
 JOBS := $(shell nproc)
 

@@ -78,6 +78,7 @@ struct Smoothed {
     /// curved the bias of a mean grows as the variance of its square's pixels, side^2 - 1, and so
     /// it is in proportion to that difference.
     double squared_bias(std::size_t r, std::size_t pixel) const {
+        if (r == 0) return 0.0;  // a pixel itself has none
         const auto spread = [](std::size_t radius) {
             const double side = 2.0 * static_cast<double>(radius) + 1.0;
             return side * side - 1.0;
@@ -107,31 +108,27 @@ struct Left {
 
     void add(const std::array<Smoothed, 3>& channels, const Bucket& window, std::size_t r, int x0,
              int y0) {
-        double block_variance = 0.0, block_bias = 0.0, block_pixels = 0.0;
+        double block_variance = 0.0, block_bias = 0.0;
         for (const Smoothed& channel : channels) {
-            double level = 0.0, variances = 0.0, biases = 0.0, pixels = 0.0;
+            double level = 0.0, variances = 0.0, biases = 0.0;
             for (int y = y0; y < y0 + block; ++y) {
                 for (int x = x0; x < x0 + block; ++x) {
                     const auto pixel = static_cast<std::size_t>(y * window.width() + x);
                     level += channel.level(pixel) / (block * block);
                     variances += channel.variance(r, pixel) / (block * block);
                     biases += channel.squared_bias(r, pixel) / (block * block);
-                    pixels += channel.variance(0, pixel) / (block * block);
                 }
             }
             const double scale = 1.0 / (level * level + 0.01) / 3.0;
             block_variance += scale * variances;
             block_bias += scale * biases;
-            block_pixels += scale * pixels;
         }
         variance.add(block_variance);
         squared_bias.add(block_bias);
         squared_error.add(block_variance + block_bias);
-        pixel_variance.add(block_pixels);
     }
 
     BlockMean variance, squared_bias, squared_error;
-    BlockMean pixel_variance;  // before smoothing
 };
 
 }  // namespace
@@ -157,10 +154,11 @@ double smoothed_error(const Partial& half, const Partial& other, double margin) 
             least = std::min(least, std::max(left.squared_error.upper(margin),
                                              left.variance.mean() + finest.squared_bias.mean()));
         }
-        // Few blocks may seem free of error by chance: no square leaves less than its mean does of
-        // pixels' noise.
-        constexpr double pixels = (2 * largest + 1) * (2 * largest + 1);
-        greatest = std::max({greatest, least, finest.pixel_variance.mean() / pixels});
+        // Few blocks may seem free of error by chance, but no square leaves less than the mean of
+        // its pixels does of their noise.
+        constexpr double most_pixels = (2 * largest + 1) * (2 * largest + 1);
+        const Left pixels(channels, window, 0);
+        greatest = std::max({greatest, least, pixels.variance.mean() / most_pixels});
     }
     return std::sqrt(greatest);
 }

@@ -18,8 +18,7 @@ enum class Estimator {
     /// extinction.
     collision,
     /// The talk's step (Wrenninge 2015), through a medium that is taken to be everywhere as dense
-    /// as
-    /// where the step starts: Woodcock tracking with the majorant approximated by the local
+    /// as where the step starts: Woodcock tracking with the majorant approximated by the local
     /// extinction. The ray's origin, which lies in the medium's box, moves to the step's end. From
     /// where there is no density it goes on as in delta tracking.
     local_step,

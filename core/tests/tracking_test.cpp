@@ -239,7 +239,8 @@ TEST_P(TrackerTest, FindsTheSameWithHoweverManyLanesAndWhateverElseIsTracked) {
 }
 
 TEST_P(TrackerTest, LocalStepsAreThoseOfTheExtinctionWhereTheyStart) {
-    // From anywhere in the box, a tenth of it being empty and some of it filled throughout.
+    // From anywhere in the box, whether its extinction is known or not; two flights in a hundred
+    // have no length.
     const V3d low(volume_->tree().low()), size = V3d(volume_->tree().high()) - low;
     std::vector<Track> from;
     for (std::size_t i = 0; i < 3000; ++i) {

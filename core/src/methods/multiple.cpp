@@ -9,8 +9,8 @@
 // more ends the path.
 //
 // Beyond the talk, and with its mean: bridges find the light of distant lights with less noise, and
-// fly by the same steps; and two walks go on from each first event, whose march takes as long as a
-// walk and whose noise is less.
+// fly by the same steps; and two walks go on from each first event, for its march and its light
+// take a good part of a sample's time and have little of the noise.
 #include "first_event.h"
 #include "methods.h"
 
