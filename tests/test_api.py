@@ -15,9 +15,12 @@ from redis import Redis
 
 from pileus_service.app import create_app
 from pileus_service.auth import Guard
+from pileus_service.errors import InputError
 from pileus_service.farm import Farm
 from pileus_service.jobs import Job, Merged, Planned, Wish, WorkerInfo
 from pileus_service.queue import Queue
+from pileus_service.server import make_server
+from pileus_service.store import Store
 
 LOCAL = "http://127.0.0.1"
 WORKER = WorkerInfo(name="W", host="host", pid=1, threads=1, started=0.0)
@@ -153,23 +156,23 @@ def test_events_tell_each_change_until_the_end(
             if line.startswith("data:"):
                 states.append(json.loads(line[5:])["state"])
                 if len(states) == 1:
-                    work(farm.queue)
+                    work(farm)
     assert states[0] == "queued"
     assert states[-1] == "done"
 
 
-def work(queue: Queue) -> None:
+def work(farm: Farm) -> None:
     """Does all tasks there are as a worker would, without rendering."""
-    while task := queue.claim(WORKER):
+    while task := farm.queue.claim(WORKER, farm.store.farm()):
         planned = Planned(tasks=0, finished=[], total=0, samples=0)
-        queue.complete(task, "W", planned if task.kind == "plan" else Merged())
+        farm.queue.complete(task, "W", planned if task.kind == "plan" else Merged())
 
 
 def test_a_redis_that_was_emptied_is_filled_again_from_disk(
     client: TestClient, farm: Farm, shot: dict[str, Any], redis: Redis
 ) -> None:
     done = submit(client, {**shot, "frames": "1"})
-    work(farm.queue)
+    work(farm)
     paused = submit(client, shot, priority=8)
     cancelled = submit(client, shot)
     client.post(f"/v1/jobs/{paused}/pause")
@@ -242,7 +245,7 @@ def test_of_many_listeners_each_hears_the_end_once(
         heard += [crowd.submit(listen) for _ in range(4)]  # late, and told by the same look
         time.sleep(1.5)
         client.post(f"/v1/jobs/{job}/resume")
-        work(farm.queue)
+        work(farm)
         told = [each.result(30) for each in heard]
     assert all(states[-1] == "done" and states.count("done") == 1 for states in told), told
     assert all("paused" in states for states in told), told
@@ -261,6 +264,39 @@ def test_a_data_folder_that_fails_is_a_problem_and_not_for_ever(
     away.rename(farm.store.jobs_folder)
     job = submit(client, shot)
     assert client.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
+
+
+def test_a_data_folder_that_is_not_mounted_any_more_costs_no_job(
+    client: TestClient, farm: Farm, shot: dict[str, Any]
+) -> None:
+    job = submit(client, shot)
+    root, away = farm.store.root, farm.store.root.with_name("away")
+    root.rename(away)
+    farm.store.jobs_folder.mkdir(parents=True)  # a worker's doing, say
+    assert "mount" in problem(client.post("/v1/jobs", json={"shot": shot}), 503)
+    assert "mount" in problem(client.get("/readyz"), 503)
+    time.sleep(1.5)
+    assert farm.queue.job_ids(10) == [job]
+    assert not list(farm.store.jobs_folder.iterdir())
+    farm.store.jobs_folder.rmdir()
+    root.rmdir()
+    away.rename(root)
+    submit(client, shot)
+    wait_for(lambda: farm.agreement.states() == {"running": 2})
+
+
+def test_two_farms_on_one_redis_leave_each_others_jobs(
+    client: TestClient, farm: Farm, shot: dict[str, Any], redis_url: str
+) -> None:
+    job = submit(client, shot)
+    other = farm.store.root.with_name("other")
+    with pytest.raises(InputError, match="another data folder"):
+        make_server(other, redis_url, farm.roots.folders, "127.0.0.1:0")
+    second = TestClient(create_app(Farm(Store(other), farm.queue, farm.roots), Guard()), LOCAL)
+    assert "another data folder" in problem(second.post("/v1/jobs", json={"shot": shot}), 503)
+    assert farm.queue.job_ids(10) == [job]
+    farm.queue.redis.flushall()
+    assert second.post("/v1/jobs", json={"shot": shot}).is_success, "Redis was emptied for it"
 
 
 def test_no_redis_is_a_problem_not_a_stack_trace(farm: Farm, shot: dict[str, Any]) -> None:

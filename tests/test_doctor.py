@@ -10,6 +10,8 @@ import pytest
 from redis import Redis
 
 from pileus_service import doctor
+from pileus_service.queue import Queue, connect
+from pileus_service.store import Store
 from pileus_worker.private_redis import PrivateRedis
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
@@ -18,7 +20,7 @@ PILEUS = str(Path(sys.executable).with_name("pileus"))
 @pytest.fixture
 def own_redis(tmp_path: Path) -> Iterator[Redis]:
     """One that a test may spoil."""
-    with PrivateRedis(tmp_path / "redis") as server, Redis.from_url(server.url) as client:
+    with PrivateRedis(tmp_path / "redis") as server, connect(server.url) as client:
         yield client
 
 
@@ -45,6 +47,14 @@ def test_a_redis_that_may_forget_is_wrong(own_redis: Redis) -> None:
     assert found["Redis when it is full"] == "wrong"
     assert found["Redis's memory of itself"] == "warning"
     assert found["Redis's room"] == "warning"
+
+
+def test_a_redis_of_another_farm_is_told(own_redis: Redis, tmp_path: Path) -> None:
+    store, queue = Store(tmp_path / "data"), Queue(own_redis)
+    assert not list(doctor.one_farm(store.root, own_redis)), "no farm has begun"
+    assert queue.serves(store.begin())
+    assert levels(doctor.one_farm(store.root, own_redis)) == {"data folder and Redis": "ok"}
+    assert levels(doctor.one_farm(tmp_path, own_redis)) == {"data folder and Redis": "wrong"}
 
 
 def test_a_root_that_holds_the_data_folder_is_told(tmp_path: Path) -> None:

@@ -66,3 +66,23 @@ def test_a_worker_renders_where_its_own_mounts_are(
     plan = Plan.model_validate_json((frames / "plan.json").read_bytes())
     assert plan.cache.path == str(farm / "caches" / "cloud.vdb")
     assert json.loads((frames / "done.json").read_text())["file"] == str(asked.output(1))
+
+
+def test_a_worker_whose_data_folder_is_not_mounted_waits_and_fails_nothing(
+    tmp_path: Path, redis_url: str, redis: object, shot: dict[str, Any]
+) -> None:
+    data, mount = tmp_path / "data", tmp_path / "mount"
+    (tmp_path / "caches").mkdir()
+    cloud = tmp_path / "caches" / "cloud.0001.vdb"
+    core.make_cloud(str(cloud), frame=1, frames=1, resolution=32)
+    shot["frames"] = "1"
+    with service(data, redis_url, tmp_path) as client:
+        job = client.submit(Shot.model_validate(shot)).job.id
+        command: list[str | Path] = [PILEUS, "worker", "--data", mount, "--redis", redis_url]
+        with process(tmp_path / "worker.log", *command, "--root", tmp_path, "--threads", "1"):
+            until(lambda: any("mounted" in (each.aside or "") for each in client.workers()), 60)
+            assert client.job(job).state == "queued"
+            mount.rename(tmp_path / "before")
+            mount.symlink_to(data)
+            until(lambda: client.job(job).state in ("done", "failed"), 300)
+        assert client.job(job).state == "done", client.job(job).reason

@@ -52,6 +52,20 @@ def test_a_worker_that_is_not_able_gets_nothing_and_with_trouble_is_not_waited_f
     assert take(queue, A).entry == task.entry
 
 
+def test_a_worker_with_another_data_folder_gets_nothing_and_is_told(queue: Queue) -> None:
+    submit(queue)
+    assert queue.claim(A, "ours"), "no service has said whose this Redis is"
+    assert queue.serves("ours")
+    assert not queue.serves("other")
+    lapse(queue)
+    for farm in ("other", None):
+        assert queue.claim(B, farm) is None
+    [told] = [view.aside for view in queue.workers() if view.name == "B"]
+    assert told is not None
+    assert "mounted" in told
+    assert queue.claim(C, "ours")
+
+
 def test_a_drained_worker_gets_nothing_until_it_is_told_otherwise(queue: Queue) -> None:
     submit(queue)
     take(queue, A)

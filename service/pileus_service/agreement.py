@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 
 import structlog
 
+from pileus_service.errors import ForeignError
 from pileus_service.jobs import TERMINAL, Wish
 from pileus_service.queue import Mark, Queue, Standing, Verb
 from pileus_service.store import Store
@@ -34,14 +35,32 @@ class Agreement:
         self._queue = queue
         self._hooks = hooks
         self.lock = threading.RLock()
+        self._farm: str | None = None
         self._wished: dict[str, Standing] = {}
         self._seen: Mark | None = None
         self._compared = 0.0
         self._swept = -math.inf
 
+    def check(self) -> None:
+        """Sees that disk and Redis are of this farm and no other: two farms on one Redis, or a
+        folder that is not mounted any more, would have us remove the jobs of all."""
+        if self._farm is None:
+            self._farm = self._store.begin()
+        if self._store.farm() != self._farm:
+            raise ForeignError(
+                f"--data {self._store.root}: is not the folder that it was; mount that again, or "
+                "start the service anew"
+            )
+        if not self._queue.serves(self._farm):
+            raise ForeignError(
+                f"--redis: serves the farm of another data folder than {self._store.root}; mount "
+                "that one there, take another Redis, or empty this (FLUSHDB) if its farm is gone"
+            )
+
     def reconcile(self) -> None:
         """Called each second: looks at the jobs that have changed since; at all of them at first,
         when Redis cannot tell, and as time passes."""
+        self.check()
         mark, changed = self._queue.changed(self._seen)
         self._seen = None  # a look that is cut short is followed by one at all
         now = time.monotonic()

@@ -19,7 +19,7 @@ from starlette.types import Receive, Scope, Send
 from pileus_service import __version__, framelog, metrics, pages, problems
 from pileus_service.auth import Guard
 from pileus_service.broadcast import Broadcast
-from pileus_service.errors import InputError
+from pileus_service.errors import ForeignError, InputError
 from pileus_service.farm import ConflictError, Farm
 from pileus_service.headers import SecurityHeaders
 from pileus_service.jobs import JOB_ID, FrameMap, FrameView, JobView, WorkerView
@@ -52,7 +52,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
         while True:
             try:
                 await run_in_threadpool(farm.agreement.reconcile)
-            except (RedisError, OSError) as error:
+            except (RedisError, OSError, ForeignError) as error:
                 log.warning("cannot reconcile yet", reason=str(error))
             await asyncio.sleep(1)
 
@@ -121,7 +121,7 @@ def create_app(farm: Farm, guard: Guard) -> FastAPI:
 
     @app.get("/readyz", tags=["farm"], responses=problems.responses(503))
     def ready() -> Health:
-        farm.queue.redis.ping()
+        farm.agreement.check()
         return Health()
 
     return app

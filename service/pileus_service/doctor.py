@@ -20,7 +20,8 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from pileus_service import __version__
-from pileus_service.store import write_whole
+from pileus_service.queue import Queue
+from pileus_service.store import farm_of, write_whole
 
 Level = Literal["ok", "warning", "wrong"]
 OPEN_FILES = 1024
@@ -213,6 +214,22 @@ def redis_server(redis: "Redis") -> Iterator[Finding]:
         f"{used >> 20} MiB used of {limit >> 20 if limit else 'as many as there are'}",
         "raise maxmemory, or delete old jobs",
     )
+
+
+def one_farm(data: Path, redis: "Redis") -> Iterator[Finding]:
+    """Whether data folder and Redis belong together, once a service has begun the farm."""
+    try:
+        theirs, ours = Queue(redis).farm(), farm_of(data)
+    except (RedisError, OSError):
+        return  # told already
+    if theirs is not None:
+        yield _if(
+            ours == theirs,
+            "wrong",
+            "data folder and Redis",
+            "of one farm" if ours == theirs else f"{data} is not the folder of Redis's farm",
+            "mount the farm's folder there, or name another with --data, or another --redis",
+        )
 
 
 def _clock_of_redis(redis: "Redis") -> Iterator[Finding]:

@@ -15,6 +15,10 @@ class InputError(ValueError):
         super().__init__(printable(message))
 
 
+class ForeignError(InputError):
+    """Redis or the data folder is another farm's: nothing there is ours to change."""
+
+
 class FarmError(RuntimeError):
     """The work failed although the input was right (exit code 1)."""
 

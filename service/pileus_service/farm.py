@@ -58,6 +58,7 @@ class Farm:
         wait_for_caches: bool = False,
     ) -> tuple[JobView, bool]:
         """Takes a shot in; with a key, once. Returns the job and whether it is new."""
+        self.agreement.check()  # a job in a folder that is not the farm's would be lost
         shot = shot.anchored(self.roots.first)
         numbers = shot.frame_numbers
         self.roots.check(shot, numbers)

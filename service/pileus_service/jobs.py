@@ -28,6 +28,12 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
+class FarmMark(Record):
+    """By which programs know that they share one data folder."""
+
+    id: str
+
+
 class JobState(StrEnum):
     QUEUED = "queued"
     RUNNING = "running"

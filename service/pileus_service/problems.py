@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pileus_service.errors import InputError
+from pileus_service.errors import ForeignError, InputError
 from pileus_service.headers import HEADERS
 from pileus_service.queue import trouble
 
@@ -91,6 +91,10 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(InputError)
     def refused(_: Request, error: InputError) -> JSONResponse:
         return _answer(422, str(error), [])
+
+    @app.exception_handler(ForeignError)
+    def foreign(_: Request, error: ForeignError) -> JSONResponse:
+        return _answer(503, str(error), [], {"Retry-After": "10"})
 
     @app.exception_handler(RedisError)
     def no_redis(_: Request, error: RedisError) -> JSONResponse:

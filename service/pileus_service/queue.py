@@ -125,6 +125,16 @@ class Queue:
 
     # The service's side.
 
+    def serves(self, farm: str) -> bool:
+        """Whether this Redis is the farm's; one that is nobody's becomes so."""
+        if self.farm() is None:  # no write where none is needed: a full Redis takes none
+            self.redis.set("pileus:farm", farm, nx=True)
+        return self.farm() == farm
+
+    def farm(self) -> str | None:
+        """The farm that this Redis serves; None before a service has begun one."""
+        return cast(str | None, self.redis.get("pileus:farm"))
+
     def submit(
         self, job: str, name: str, created: float, frames: int, wish: Wish, done: Iterable[int] = ()
     ) -> bool:
@@ -308,14 +318,17 @@ class Queue:
 
     # The workers' side.
 
-    def claim(self, info: WorkerInfo, *, able: bool = True, trouble: str = "") -> Task | None:
+    def claim(
+        self, info: WorkerInfo, farm: str | None = None, *, able: bool = True, trouble: str = ""
+    ) -> Task | None:
         """The next task for a worker, or None; says that the worker lives either way.
 
         One that is not `able` to do a task gets none, and is shown as set aside while it has
-        `trouble`.
+        `trouble`, or a data folder (of `farm`) that is not the one this Redis is for.
         """
         reason = printable(trouble)[:500]
-        found = self._run("claim", info.name, info.model_dump_json(), int(able), reason)
+        told = info.model_dump_json()
+        found = self._run("claim", info.name, told, int(able), reason, farm or "")
         if not found:
             return None
         priority, entry, attempt, job, frame, kind, part = found

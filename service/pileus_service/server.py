@@ -7,6 +7,7 @@ import socket
 from pathlib import Path
 
 import uvicorn
+from redis.exceptions import RedisError
 
 from pileus_service import logs
 from pileus_service.app import create_app
@@ -52,7 +53,10 @@ def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> u
     # Each caller costs a file, whether or not it says anything: as many as the system gives.
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    app = create_app(Farm(store, Queue(connect(redis_url)), Roots(roots, data)), guard)
+    farm = Farm(store, Queue(connect(redis_url)), Roots(roots, data))
+    with contextlib.suppress(RedisError):  # it may come later
+        farm.agreement.check()
+    app = create_app(farm, guard)
     # Watchers hold their connections open: they are not waited for at the end.
     config = uvicorn.Config(
         app,

@@ -1,9 +1,8 @@
 """The farm's truth: a folder of jobs, their plans, partials and done markers.
 
 Every file is written whole or not at all, so what is there can be trusted after any crash, and
-Redis can be rebuilt from it. Layout: jobs/ID/{job.json,state.json}, jobs/ID/frames/NNNNNN/
-{plan.json,preview.png,done.json,
-parts/BUCKET.SAMPLES.exr,logs/WORKER.jsonl}.
+Redis can be rebuilt from it. Layout: farm.json, jobs/ID/{job.json,state.json},
+jobs/ID/frames/NNNNNN/{plan.json,preview.png,done.json,parts/BUCKET.SAMPLES.exr,logs/WORKER.jsonl}.
 """
 
 import contextlib
@@ -18,8 +17,9 @@ from typing import TypeVar, cast
 
 from pydantic import ValidationError
 
-from pileus_service.jobs import JOB_ID, Cache, Done, Job, Part, Plan, Record, Wish
+from pileus_service.jobs import JOB_ID, Cache, Done, FarmMark, Job, Part, Plan, Record, Wish
 
+FARM = "farm.json"
 R = TypeVar("R", bound=Record)
 
 
@@ -127,6 +127,12 @@ class FrameStore:
         sweep(self.folder)
 
 
+def farm_of(root: Path) -> str | None:
+    """The id of the farm whose data folder this is, if any."""
+    mark = _read(root / FARM, FarmMark)
+    return mark.id if mark else None
+
+
 class Store:
     """The data folder, shared by the service and all workers."""
 
@@ -134,6 +140,20 @@ class Store:
         self.root = root
         self.jobs_folder = root / "jobs"
         self.jobs_folder.mkdir(parents=True, exist_ok=True)
+
+    def begin(self) -> str:
+        """The farm's id, made by the first service that begins a farm here."""
+        if (held := self.farm()) is not None:
+            return held
+        mark = FarmMark(id=secrets.token_hex(8))
+        path = self.root / FARM
+        once = not path.exists()  # a damaged one is made anew
+        write_whole(path, mark.model_dump_json().encode(), once=once)
+        return self.farm() or mark.id
+
+    def farm(self) -> str | None:
+        """The farm's id; None where no farm has begun, as in a folder that is not mounted."""
+        return farm_of(self.root)
 
     def create(self, job: Job, wish: Wish) -> bool:
         """Keeps a new job; False where one of its id is there already."""

@@ -228,7 +228,7 @@ class Supervisor:
                     if self._owed is not None:
                         self._queue.hand_back(self._owed, self.info.name)
                         self._owed = None
-                    task = self._queue.claim(self.info, able=able, trouble=trouble)
+                    task = self._queue.claim(self.info, self._farm(), able=able, trouble=trouble)
                     self._away = False
                 except RedisError as error:
                     # Away, loading, or its disk is full: it comes back, and we are here then.
@@ -246,6 +246,13 @@ class Supervisor:
                 log.info("Redis is gone before us; nothing to say goodbye to")
         finally:
             self._drop_child()
+
+    def _farm(self) -> str | None:
+        """The farm whose data folder ours is. Asked each time: a folder can come to be mounted."""
+        try:
+            return self._store.farm()
+        except OSError:
+            return None
 
     def _readiness(self) -> tuple[bool, str]:
         """Whether the child can do a task at once, and if none will start, why. No task is claimed

@@ -39,6 +39,8 @@ def look_at_health(
         findings += doctor.folders(data, root or [])
     if redis:
         findings += doctor.redis_server(connect(redis))
+    if data and redis:
+        findings += doctor.one_farm(data, connect(redis))
     if server:
         findings += doctor.service(server, token)
     if as_json:

@@ -1,9 +1,10 @@
 -- Gives the worker ARGV[2] (described by ARGV[3]) its next task: by priority, and in each stream
 -- those whose lease ran out before new ones. Returns {priority, id, attempt, job, frame, kind, part}.
--- A worker that is not able to do one (ARGV[4] is not 1) gets none; ARGV[5] is its trouble, if it has any.
+-- A worker that is not able to do one (ARGV[4] is not 1) gets none; ARGV[5] is its trouble, if it has any,
+-- and ARGV[6] the farm of its data folder.
 local SWEEP = 250 -- milliseconds between looks for leases that ran out
 local TROUBLED = 3000 -- milliseconds for which a worker with trouble is set aside, and each time again
-local worker, info, able, trouble = ARGV[2], ARGV[3], ARGV[4], ARGV[5]
+local worker, info, able, trouble, farm = ARGV[2], ARGV[3], ARGV[4], ARGV[5], ARGV[6]
 
 local function each_stream(act)
   for priority = 9, 0, -1 do
@@ -163,6 +164,9 @@ end
 
 look_around()
 greet(worker, info)
+-- Where its data folder is another, or is not mounted, it would fail whatever it took.
+local ours = redis.call('GET', 'pileus:farm')
+if ours and ours ~= farm then trouble = "its data folder is not the farm's: is it mounted?" end
 if trouble ~= '' then set_aside(worker, TROUBLED, trouble) end
 if able ~= '1' or aside(worker) then return nil end
 for priority = 9, 0, -1 do
