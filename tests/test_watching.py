@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 from rich.console import Console
 
-from pileus_service import framelog, logs, terminal
+from pileus_service import doctor, framelog, logs, terminal
 from pileus_service.client import Client
 from pileus_service.jobs import (
     Doing,
@@ -35,6 +35,7 @@ from pileus_service.jobs import (
     Wish,
     WorkerView,
 )
+from pileus_service.progress import Display, Row
 from pileus_service.shot import Shot
 from pileus_service.store import Store
 from pileus_worker.embedded import EmbeddedFarm, Workers, embedded_farm
@@ -219,6 +220,45 @@ def test_a_running_job_shows_its_buckets_its_workers_and_the_time_left() -> None
         r"cirrus +● at work +4 +render frame 7, pixels 0,32 to 64,96, samples 8 to 16", told
     )
     assert "nimbus" not in told
+
+
+NAME = "plume[/wip] [red] :cloud:"
+
+
+def test_what_others_have_named_is_shown_as_it_is() -> None:
+    job = JobView(
+        id="j", name=NAME, state=JobState.RUNNING, priority=5, frames=1, frames_done=0,
+        frames_failed=1, progress=0.5, samples=0, tasks=0, created=0.0,
+    )  # fmt: skip
+    seen = {"host": "h", "pid": 1, "threads": 4, "started": 0.0, "seen": 0.0, "alive": True}
+    busy = WorkerView(name=NAME, doing=Doing(job="j", frame=1, kind=Kind.MERGE), **seen)
+    aside = WorkerView(name="b", aside=NAME, **seen)
+    failed = FrameView(frame=1, state="failed", reason=NAME)
+    finding = doctor.Finding(level="wrong", what="root", found=NAME, mend=NAME)
+    frame_map = FrameMap(frames="1", states="f", width=1, height=1)
+    for picture, times in (
+        (terminal.job_table([job]), 1),
+        (terminal.worker_table([busy, aside], {"j": NAME}), 3),
+        (terminal.job_picture(job, frame_map, [failed], []), 2),
+        (terminal.finding_table([finding]), 2),
+    ):
+        page = io.StringIO()
+        Console(file=page, width=200).print(picture)
+        assert page.getvalue().count(NAME) == times
+
+
+def test_bars_and_notes_show_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = os.openpty()
+    with os.fdopen(ours, "rb") as screen, os.fdopen(theirs, "w") as terminal_of_a_person:
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "200")
+        monkeypatch.setattr(sys, "stderr", terminal_of_a_person)
+        with Display() as display:
+            display.show(Row(f"bar {NAME}", 0.5, ""))
+            display.note(f"note {NAME}")
+        shown = screen.read1().decode()
+    assert f"bar {NAME}" in shown
+    assert f"note {NAME}" in shown
 
 
 def test_every_line_says_what_it_is_about(capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,7 +67,7 @@ class Display:
     def note(self, text: str) -> None:
         """A line that stays."""
         if self._bars:
-            self._bars.console.print(text, highlight=False, markup=False)
+            self._bars.console.print(text, highlight=False, markup=False, emoji=False)
         else:
             print(text, file=sys.stderr, flush=True)
 
@@ -84,10 +84,10 @@ def _bars() -> "Progress":
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[detail]}"),
+        TextColumn("{task.fields[detail]}", markup=False),
         console=Console(stderr=True),
         transient=True,
     )

@@ -1,4 +1,7 @@
-"""Jobs, frames and workers as one likes to see them on a terminal, drawn with rich."""
+"""Jobs, frames and workers as one likes to see them on a terminal, drawn with rich.
+
+rich reads markup in plain strings: what a user, a worker or a file has named is put into a Text.
+"""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -64,7 +67,7 @@ def job_table(jobs: Iterable[JobView]) -> Table:
     for job in jobs:
         table.add_row(
             job.id,
-            job.name,
+            Text(job.name),
             state_text(job.state),
             str(job.priority),
             f"{job.frames_done}/{job.frames}",
@@ -103,7 +106,7 @@ def worker_table(workers: Iterable[WorkerView], names: dict[str, str]) -> Table:
             task += ", pixels {},{} to {},{}".format(*doing.bucket)
             task += ", samples {} to {}".format(*doing.samples)
             progress = bar(doing.progress, "rendering", 10)
-        table.add_row(worker.name, state, str(worker.threads), task, progress)
+        table.add_row(Text(worker.name), state, str(worker.threads), Text(task), progress)
     return table
 
 
