@@ -85,6 +85,24 @@ def test_wrong_input_of_render_is_one_line_and_exit_code_two(
     assert "cloud.0001.vdb" in refused(pileus("render", shot_file))
 
 
+def test_a_data_folder_that_cannot_be_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    data = tmp_path / "file" / "data"
+    for command in (["worker"], ["up"], ["service"], ["token", "create", "ann"]):
+        assert f"--data {data}: Not a directory" in refused(pileus(*command, "--data", data))
+
+
+def test_a_service_that_cannot_be_asked_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert "--server http://h:abc" in refused(pileus("list", "--server", "http://h:abc"))
+    for token in ("ann.é", "ann.sec\nret"):
+        monkeypatch.setenv("PILEUS_TOKEN", token)
+        line = refused(pileus("list", "--server", "http://127.0.0.1:1"))
+        assert "--token" in line
+        assert "ann" not in line
+
+
 def test_make_writes_a_sequence(tmp_path: Path) -> None:
     out = tmp_path / "new" / "cloud.$F3.vdb"
     ended = pileus("make", "cloud", out, "--frames", "1-2", "--resolution", "32")

@@ -170,6 +170,17 @@ def test_an_unwritable_output(shot_file: Path, tmp_path: Path) -> None:
         check_files(shot, "shot.json", [1])
 
 
+@pytest.mark.parametrize("field", ["volumes.0.cache", "lights.1.texture", "image.output"])
+def test_a_path_that_the_system_refuses_to_look_at(
+    shot_file: Path, tmp_path: Path, field: str
+) -> None:
+    (tmp_path / "caches").mkdir()
+    (tmp_path / "caches" / "cloud.0001.vdb").touch()
+    shot = load_shot(shot_file, [f"{field}={'x' * 300}.####.exr"])
+    with pytest.raises(InputError, match=f"^shot.json: {field}: file name too long: .*xxx"):
+        check_files(shot, "shot.json", [1])
+
+
 @pytest.mark.parametrize(
     "example", sorted(Path(__file__).parents[1].glob("examples/*.toml")), ids=lambda path: path.stem
 )

@@ -25,7 +25,12 @@ class Client:
     def __init__(self, server: str, token: str | None = None) -> None:
         self._server = server
         headers = {"Authorization": f"Bearer {token}"} if token else {}
-        self._http = httpx.Client(base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=30)
+        try:
+            self._http = httpx.Client(
+                base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=30
+            )
+        except httpx.InvalidURL as error:
+            raise InputError(f"--server {server}: {error}; write http://HOST:PORT") from None
 
     def __enter__(self) -> Self:
         return self

@@ -1,5 +1,9 @@
 """The errors that a user can mend; each message is the one line that reaches them."""
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
 from pydantic import ValidationError
 
 
@@ -24,6 +28,15 @@ class FarmError(RuntimeError):
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))
+
+
+@contextlib.contextmanager
+def data_troubles(data: Path) -> Iterator[None]:
+    """What the system refuses to do in the data folder is one line."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
 
 
 def one_line(source: str, error: ValidationError) -> str:

@@ -1,9 +1,12 @@
 """Command-line options that several commands take."""
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from pileus_service.errors import InputError
 
 ShotFile = Annotated[Path, typer.Argument(metavar="SHOT", help="The shot, TOML or JSON.")]
 Frames = Annotated[str | None, typer.Option(help='Only these, as "1-24x2".')]
@@ -12,11 +15,25 @@ Sets = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object for scripts.")]
 
+
+def _sendable(token: str | None) -> str | None:
+    """A header holds no other characters, and no token has them."""
+    if token is not None and not re.fullmatch(r"[!-~]*", token):
+        # Never the token itself: others may look at the terminal.
+        raise InputError(
+            "--token, PILEUS_TOKEN: is no token; give it as `pileus token create` has shown it"
+        )
+    return token
+
+
 Server = Annotated[
     str, typer.Option(envvar="PILEUS_SERVER", help="The service's address.", metavar="URL")
 ]
 Token = Annotated[
-    str | None, typer.Option(envvar="PILEUS_TOKEN", help="The service's token.", metavar="TOKEN")
+    str | None,
+    typer.Option(
+        envvar="PILEUS_TOKEN", help="The service's token.", metavar="TOKEN", callback=_sendable
+    ),
 ]
 
 Data = Annotated[Path, typer.Option(envvar="PILEUS_DATA", help="The farm's folder.")]

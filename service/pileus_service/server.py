@@ -12,7 +12,7 @@ from redis.exceptions import RedisError
 from pileus_service import logs
 from pileus_service.app import create_app
 from pileus_service.auth import guard_for
-from pileus_service.errors import InputError
+from pileus_service.errors import InputError, data_troubles
 from pileus_service.farm import Farm
 from pileus_service.queue import Queue, connect
 from pileus_service.roots import Roots
@@ -45,11 +45,9 @@ def bind(listen: str) -> socket.socket:
 def make_server(data: Path, redis_url: str, roots: list[Path], listen: str) -> uvicorn.Server:
     """A server ready to run."""
     host, _ = split_address(listen)
-    try:
+    with data_troubles(data):
         store = Store(data.resolve())
         guard = guard_for(host, data)
-    except OSError as error:
-        raise InputError(f"--data {data}: {error.strerror}; choose another folder") from None
     # Each caller costs a file, whether or not it says anything: as many as the system gives.
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))

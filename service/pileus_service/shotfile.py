@@ -1,9 +1,10 @@
 """Reads shots from TOML or JSON files, with `--set section.key=value` overrides."""
 
+import contextlib
 import json
 import tempfile
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,9 @@ def check_files(shot: Shot, source: str, frames: Iterable[int], *, caches: bool 
     missing: dict[str, list[Path]] = {}
     for frame in frames:
         for field, file in shot.inputs(frame):
-            if not file.is_file() and (caches or not field.startswith("volumes.")):
+            with _troubles(source, field, file):
+                there = file.is_file()
+            if not there and (caches or not field.startswith("volumes.")):
                 missing.setdefault(field, []).append(file)
     for field, files in missing.items():
         name = files[0]
@@ -49,10 +52,21 @@ def check_files(shot: Shot, source: str, frames: Iterable[int], *, caches: bool 
             )
         raise InputError(f"{source}: {field}: no such file {name}; mend the path")
     for output in {shot.output(frame) for frame in frames}:
-        if output.is_dir():
-            raise InputError(f"{source}: image.output: {output} is a folder; name a file")
+        with _troubles(source, "image.output", output):
+            if output.is_dir():
+                raise InputError(f"{source}: image.output: {output} is a folder; name a file")
     for folder in {shot.output(frame).parent for frame in frames}:
         _check_writable(folder, source)
+
+
+@contextlib.contextmanager
+def _troubles(source: str, field: str, path: Path) -> Iterator[None]:
+    """A path that the system refuses to look at is one line."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or "unreadable").lower()
+        raise InputError(f"{source}: {field}: {reason}: {path}; mend the path") from None
 
 
 def _patterns(shot: Shot) -> Iterable[tuple[str, str]]:

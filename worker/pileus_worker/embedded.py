@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from pileus_service.errors import FarmError, InputError
+from pileus_service.errors import FarmError, InputError, data_troubles
 from pileus_service.server import bind, make_server
 from pileus_worker import machine
 from pileus_worker.commands.worker import TASK_SECONDS
@@ -84,13 +84,13 @@ def embedded_farm(
 ) -> Iterator[EmbeddedFarm]:
     """Runs a farm while the block runs; whatever ends the block ends all of it, in order."""
     data = data.resolve()
-    data.mkdir(parents=True, exist_ok=True)
-    with (
-        _alone_in(data),
-        PrivateRedis(data / "redis") as redis,
-        contextlib.closing(bind(listen)) as listener,
-        (data / "workers.log").open("ab") as log,
-    ):
+    with contextlib.ExitStack() as held:
+        with data_troubles(data):
+            data.mkdir(parents=True, exist_ok=True)
+            held.enter_context(_alone_in(data))
+            log = held.enter_context((data / "workers.log").open("ab"))
+            redis = held.enter_context(PrivateRedis(data / "redis"))
+        listener = held.enter_context(contextlib.closing(bind(listen)))
         server = make_server(data, redis.farm_url, roots, listen)
         workers = Workers(_command(data, redis.farm_url, roots, count, task_seconds), count, log)
         ending, over = threading.Event(), threading.Event()

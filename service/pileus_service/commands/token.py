@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from pileus_service.auth import Role, Tokens
+from pileus_service.errors import data_troubles
 from pileus_service.options import DATA, AsJson, Data
 
 app = typer.Typer(
@@ -22,13 +23,15 @@ def create(
     data: Data = DATA,
 ) -> None:
     """Makes a token and shows it, this once."""
-    print(Tokens(data).create(name, role))
+    with data_troubles(data):
+        print(Tokens(data).create(name, role))
 
 
 @app.command()
 def revoke(name: Name, data: Data = DATA) -> None:
     """Ends a token, at once."""
-    Tokens(data).revoke(name)
+    with data_troubles(data):
+        Tokens(data).revoke(name)
     print(f"{name}: revoked")
 
 
@@ -38,7 +41,8 @@ def list_tokens(
     as_json: AsJson = False,
 ) -> None:
     """Lists the tokens' names, roles and ages; the tokens themselves are not kept."""
-    tokens = Tokens(data).all()
+    with data_troubles(data):
+        tokens = Tokens(data).all()
     if as_json:
         print(json.dumps([token.model_dump(mode="json", exclude={"digest"}) for token in tokens]))
         return

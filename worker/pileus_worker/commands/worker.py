@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from pileus_service import logs
+from pileus_service.errors import data_troubles
 from pileus_service.framelog import FrameLog
 from pileus_service.options import DATA, REDIS, Data, Redis, RootFolders
 from pileus_service.queue import Queue, connect
@@ -57,7 +58,8 @@ def worker(
     After SIGTERM it finishes its task within the grace or hands it back; a second one, or Ctrl-C,
     makes it hand the task back at once.
     """
-    store = Store(data.resolve())
+    with data_troubles(data):
+        store = Store(data.resolve())
     logs.configure(FrameLog(store))
     ending = Ending(grace)
     signal.signal(signal.SIGTERM, lambda *_: ending.ask())
