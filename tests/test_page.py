@@ -3,9 +3,12 @@
 import re
 import shutil
 import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pileus_core as core
 import pytest
 from fastapi.testclient import TestClient
@@ -62,8 +65,8 @@ def test_the_page_asks_only_what_the_api_answers(client: TestClient) -> None:
         assert any(re.fullmatch(path, address) for path in answered), address
 
 
-def dom(page: str, folder: Path) -> str:
-    """What a browser makes of a page, which must have nothing to complain of."""
+def dom(page: str, folder: Path, expected: str = "") -> str:
+    """What a browser makes of a page, which must have nothing else to complain of."""
     browser = shutil.which("chromium")
     if browser is None:
         pytest.skip("no browser is here: apt-get install chromium")
@@ -71,7 +74,8 @@ def dom(page: str, folder: Path) -> str:
     command += ["--disable-background-networking", "--enable-logging=stderr"]
     command += [f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=5000", page]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert "CONSOLE" not in ended.stderr, ended.stderr
+    complaints = [line for line in ended.stderr.splitlines() if "CONSOLE" in line]
+    assert all(expected and expected in line for line in complaints), complaints
     return ended.stdout
 
 
@@ -102,3 +106,44 @@ def test_the_page_shows_a_job_in_a_browser(tmp_path: Path, shot: dict[str, Any])
     assert 'src="blob:' in page
     assert "cloud.0002.vdb" in page
     assert page.count("threads") + page.count("1 thread") >= 1
+
+
+class Breaking(BaseHTTPRequestHandler):
+    """Passes what is asked on to a farm, and breaks its first stream of events off."""
+
+    protocol_version = "HTTP/1.1"
+    farm = ""
+    broken = False
+
+    def do_GET(self) -> None:
+        answer = httpx.get(self.farm + self.path)
+        self.send_response(answer.status_code)
+        self.send_header("Content-Type", answer.headers["content-type"])
+        self.send_header("Content-Length", str(len(answer.content)))
+        self.end_headers()
+        if self.path.endswith("/events") and not type(self).broken:
+            type(self).broken = self.close_connection = True
+        else:
+            self.wfile.write(answer.content)
+
+
+@pytest.mark.slow
+def test_the_page_follows_a_job_on_after_its_stream_has_broken(
+    tmp_path: Path, shot: dict[str, Any]
+) -> None:
+    with (
+        embedded_farm(tmp_path / "farm", [tmp_path], 1, "127.0.0.1:0") as farm,
+        Client(farm.url) as client,
+        ThreadingHTTPServer(("127.0.0.1", 0), Breaking) as between,
+    ):
+        job = client.submit(Shot.model_validate(shot), wait_for_caches=True).job.id
+        client.control(job, "cancel")
+        Breaking.farm = farm.url
+        threading.Thread(target=between.serve_forever).start()
+        try:
+            address = f"http://127.0.0.1:{between.server_port}/#{job}"
+            page = dom(address, tmp_path, expected="net::ERR_CONTENT_LENGTH_MISMATCH")
+        finally:
+            between.shutdown()
+    assert Breaking.broken
+    assert '<span class="state cancelled">cancelled</span>' in page

@@ -12,30 +12,31 @@ export class Refused extends Error {
 
 export const keepToken = (token) => sessionStorage.setItem(KEPT, token);
 
+// A connection may break at any time: as well while the body of an answer is read.
+function broken(error) {
+  if (error.name === "AbortError") throw error;
+  throw new Refused(0, "The service does not answer; trying again");
+}
+
 export async function ask(path, options = {}) {
   const headers = new Headers(options.headers);
   const token = sessionStorage.getItem(KEPT);
   if (token) headers.set("Authorization", `Bearer ${token}`);
-  let answer;
-  try {
-    answer = await fetch(path, { ...options, headers });
-  } catch (error) {
-    if (error.name === "AbortError") throw error;
-    throw new Refused(0, "The service does not answer; trying again");
-  }
+  const answer = await fetch(path, { ...options, headers }).catch(broken);
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({}));
   throw new Refused(answer.status, problem.detail ?? `The service answered ${answer.status}`);
 }
 
-export const get = async (path) => (await ask(path)).json();
+export const get = async (path) => (await ask(path)).json().catch(broken);
 
 export const send = async (method, path, body) => {
   const headers = body === undefined ? {} : { "Content-Type": "application/json" };
-  return (await ask(path, { method, headers, body: body && JSON.stringify(body) })).json();
+  const answer = await ask(path, { method, headers, body: body && JSON.stringify(body) });
+  return answer.json().catch(broken);
 };
 
-export const blob = async (path) => (await ask(path)).blob();
+export const blob = async (path) => (await ask(path)).blob().catch(broken);
 
 // Server-sent events through fetch: EventSource cannot send a token.
 export async function* events(path, signal) {
@@ -43,7 +44,7 @@ export async function* events(path, signal) {
   const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
   let held = "";
   for (;;) {
-    const { value, done } = await reader.read();
+    const { value, done } = await reader.read().catch(broken);
     if (done) return;
     held += value.replaceAll("\r", "");
     const messages = held.split("\n\n");
