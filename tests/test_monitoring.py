@@ -14,6 +14,7 @@ from redis import Redis
 from pileus_service import metrics
 from pileus_service.jobs import Wish
 from pileus_service.queue import Queue
+from queueing import A, B
 
 FOLDER = Path(__file__).parent.parent / "deploy" / "monitoring"
 
@@ -56,6 +57,26 @@ def test_every_metric_and_label_that_is_asked_for_is_exported(exposition: str) -
                 assert matching or value in values, f"{where}: {label}={value}, not {values}"
         for label in re.findall(r"by \((\w+)\)", expression):
             assert all(label in exported[name] for name, *_ in names), f"{where}: by {label}"
+
+
+def test_every_metric_and_phase_that_the_page_tells_of_is_exported(exposition: str) -> None:
+    page = (FOLDER.parents[1] / "docs" / "watching.md").read_text()
+    told = set(re.findall(r"`(pileus_\w+)`", page))
+    assert len(told) > 10
+    assert all(f"\n{name} " in exposition or f"\n{name}{{" in exposition for name in told), told
+    [phases] = re.findall(r"by `phase`: ([\w, ]+)", page)
+    exported = re.findall(r'phase_seconds_total\{phase="(\w+)"', exposition)
+    assert exported == phases.strip().split(", ")
+
+
+def test_a_worker_counts_as_set_aside_for_a_fault_and_not_for_being_drained(redis: Redis) -> None:
+    queue = Queue(redis)
+    queue.claim(A, able=False, trouble="no memory")
+    queue.claim(B)
+    queue.drain("B")
+    exposition = metrics.exposition(queue, {}).decode()
+    assert "\npileus_workers 2.0" in exposition
+    assert "\npileus_workers_aside 1.0" in exposition
 
 
 @pytest.mark.slow

@@ -88,3 +88,5 @@ def test_how_long_the_next_task_has_waited(queue: Queue) -> None:
     assert lines[5].wait >= lines[7].wait + 0.199
     first = take(queue)
     assert (first.job, queue.lines()[7]) == ("later", (0, 1, 0.0))
+    queue.hand_back(first, "A")
+    assert queue.depths()[7] == (1, 0), "what was given up waits again"

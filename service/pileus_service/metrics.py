@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 
 from pileus_service.jobs import Cause, JobState, Kind
 from pileus_service.measures import Measures
-from pileus_service.queue import Queue
+from pileus_service.queue import DRAINED, Queue
 
 _COUNTED = {
     "tasks_done": "Tasks completed",
@@ -19,6 +19,7 @@ _COUNTED = {
     "frames_failed": "Frames given up",
     "leases_lost": "Leases that ran out because a worker stopped answering",
     "tasks_parked": "Tasks given up after their last attempt",
+    "workers_set_aside": "Times that a worker was set aside as its tasks went well elsewhere",
     "samples": "Pixel samples rendered",
 }
 # What exists before it has happened can be alerted on: a rate needs a first value.
@@ -31,7 +32,7 @@ _MEASURED: dict[str, tuple[str, list[str], list[list[str]]]] = {
     "phase_seconds": (
         "Seconds of attempts by what they were spent on",
         ["phase"],
-        [[phase] for phase in ("load", "plan", "render", "merge", "write", "other")],
+        [[phase] for phase in ("load", "plan", "render", "merge", "denoise", "write", "other")],
     ),
     "core_seconds": ("Seconds of attempts times the threads they had", [], [[]]),
     "cpu_seconds": ("Processor seconds that the render processes used", [], [[]]),
@@ -88,8 +89,11 @@ class _FarmCollector(Collector):
     def _workers(self) -> Iterator[Family]:
         alive = [worker for worker in self._queue.workers() if worker.alive]
         busy = [worker for worker in alive if worker.task]
+        # A drained one gets no tasks because somebody wants it so.
+        aside = [worker for worker in alive if worker.aside not in (None, DRAINED)]
         for name, text, value in (
             ("workers", "Workers alive", len(alive)),
+            ("workers_aside", "Workers alive that are set aside for a fault", len(aside)),
             ("workers_busy", "Workers with a task", len(busy)),
             ("threads", "Threads of the workers alive", sum(each.threads for each in alive)),
             ("threads_busy", "Threads of workers with a task", sum(each.threads for each in busy)),

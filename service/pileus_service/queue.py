@@ -40,6 +40,8 @@ LEASE = 10.0
 RENEWAL = 2.5
 PRIORITIES = range(10)
 GROUP = "workers"
+RELEASED = "released"  # the consumer that holds what a worker gave up or lost, as common.lua has it
+DRAINED = "drained"
 SHARED = ("common", "issue", "attempts")
 SCRIPTS = ("submit", "claim", "renew", "complete", "release", "control", "views")
 VIEWS = 100  # jobs that are looked at in one step, for which all others wait
@@ -268,7 +270,7 @@ class Queue:
     def drain(self, worker: str) -> None:
         """Gives a worker no more tasks; what it has in hand it finishes."""
         self.redis.zadd("pileus:aside", {worker: "+inf"})
-        self.redis.hset("pileus:aside:why", worker, "drained")
+        self.redis.hset("pileus:aside:why", worker, DRAINED)
 
     def undrain(self, worker: str) -> None:
         """Gives a worker tasks again that was drained or set aside."""
@@ -293,16 +295,19 @@ class Queue:
         streams = {each: f"pileus:tasks:{each}" for each in PRIORITIES if there[each]}
         for stream in streams.values():
             ask.xlen(stream)
+            ask.xpending(stream, GROUP)
             ask.xinfo_groups(stream)
         told = ask.execute()
-        held = [(length, group) for length, [group] in zip(told[::2], told[1::2], strict=True)]
-        for stream, (_, group) in zip(streams.values(), held, strict=True):
+        for stream, [group] in zip(streams.values(), told[2::3], strict=True):
             ask.xrange(stream, f"({group['last-delivered-id']}", "+", 1)
         lines = {}
-        for priority, (length, group), ahead in zip(streams, held, ask.execute(), strict=True):
+        each = zip(streams, told[::3], told[1::3], ask.execute(), strict=True)
+        for priority, length, pending, ahead in each:
             begun = int(ahead[0][0].split("-")[0]) / 1000 if ahead else math.inf
             wait = max(0.0, seconds + micros / 1e6 - begun)
-            lines[priority] = Line(length - group["pending"], group["pending"], wait)
+            owners = pending["consumers"]
+            held = sum(owner["pending"] for owner in owners if owner["name"] != RELEASED)
+            lines[priority] = Line(length - held, held, wait)
         return lines
 
     def depths(self) -> dict[int, tuple[int, int]]:
