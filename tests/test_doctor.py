@@ -29,10 +29,9 @@ def levels(findings: Iterator[doctor.Finding]) -> dict[str, str]:
 
 
 def test_what_is_well_is_called_well(own_redis: Redis, tmp_path: Path) -> None:
-    for folder in ("data", "root"):
-        (tmp_path / folder).mkdir()
+    (tmp_path / "data").mkdir()
     assert set(levels(doctor.host()).values()) == {"ok"}
-    found = levels(doctor.folders(tmp_path / "data", [tmp_path / "root"]))
+    found = levels(doctor.folders(tmp_path / "data", [tmp_path]))  # as `pileus up` has them
     assert (found["data folder"], found["root"]) == ("ok", "ok")
     assert not list((tmp_path / "data").iterdir())
     found = levels(doctor.redis_server(own_redis))
@@ -55,12 +54,6 @@ def test_a_redis_of_another_farm_is_told(own_redis: Redis, tmp_path: Path) -> No
     assert queue.serves(store.begin())
     assert levels(doctor.one_farm(store.root, own_redis)) == {"data folder and Redis": "ok"}
     assert levels(doctor.one_farm(tmp_path, own_redis)) == {"data folder and Redis": "wrong"}
-
-
-def test_a_root_that_holds_the_data_folder_is_told(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    found = [each.level for each in doctor.folders(tmp_path / "data", [tmp_path])]
-    assert found[-1] == "warning"
 
 
 def test_what_is_not_there_is_named_with_a_mend(tmp_path: Path) -> None:

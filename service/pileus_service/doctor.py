@@ -107,13 +107,6 @@ def folders(data: Path | None, roots: list[Path]) -> Iterator[Finding]:
             f"{root}{'' if reachable else ' cannot be read and written'}",
             f"mount it, or let user {os.geteuid()} read and write there",
         )
-        if data is not None and data.resolve().is_relative_to(root.resolve()):
-            yield Finding(
-                level="warning",
-                what="root",
-                found=f"{root} holds the data folder: shots may write into the farm's own files",
-                mend="keep the data folder and the roots apart",
-            )
 
 
 def _data(data: Path) -> Iterator[Finding]:
