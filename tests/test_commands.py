@@ -10,7 +10,7 @@ import numpy as np
 import pileus_core as core
 import pytest
 
-from pileus_worker import planning
+from pileus_worker import machine, planning
 from pileus_worker.commands.compare import compared
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
@@ -140,6 +140,23 @@ def test_compare_tells_the_error_as_it_is_defined(shot_file: Path, tmp_path: Pat
     assert ended.stdout.startswith("relMSE ")
     assert difference.read_bytes().startswith(b"\x89PNG")
     assert "nowhere.exr" in refused(pileus("compare", first, tmp_path / "nowhere.exr"))
+
+
+def test_memory_is_what_the_narrowest_control_group_allows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "OWN_GROUP", tmp_path / "own")
+    monkeypatch.setattr(machine, "GROUPS", tmp_path / "groups")
+    unit = tmp_path / "groups" / "system.slice" / "pileus-worker.service"
+    unit.mkdir(parents=True)
+    (tmp_path / "own").write_text("4:memory:/elsewhere\n0::/system.slice/pileus-worker.service\n")
+    whole = machine.memory_bytes()
+    (unit / "memory.max").write_text("max\n")
+    assert machine.memory_bytes() == whole
+    (unit.parent / "memory.max").write_text("1000000\n")
+    assert machine.memory_bytes() == 800_000
+    (unit / "memory.max").write_text("500000\n")
+    assert machine.memory_bytes() == 400_000
 
 
 @pytest.mark.parametrize("seconds", [1e-4, 0.01, 100.0])
