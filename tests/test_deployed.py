@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -365,6 +366,8 @@ def test_a_farm_of_units_renders_a_shot_in_its_sandbox(
         run(*inside, "systemctl", "kill", "--signal=KILL", "pileus-worker")
         until(lambda: {each.name for each in client.workers() if each.alive} - {worker.name}, 180)
     same_images(PathMap.parse([f"/shows={place}"]).shot(asked), tmp_path)
+    for made in (place / "out", place / "out" / "test.0001.exr"):
+        assert made.stat().st_mode & stat.S_IROTH, "artists are of no group of the farm's"
 
 
 def of_user(user: int) -> list[int]:
