@@ -17,8 +17,10 @@ import pileus_core as core
 import pytest
 from redis import Redis
 from tenacity import Retrying, retry_if_exception_type, stop_after_delay, wait_fixed
+from typer.testing import CliRunner
 
 from pileus_service.client import Client
+from pileus_service.commands.farm import NEWEST, app
 from pileus_service.errors import FarmError
 from pileus_service.jobs import JobView
 from pileus_service.shot import Sampling, Shot, Transport
@@ -299,6 +301,36 @@ def test_a_frame_that_cannot_be_rendered_fails_alone_with_the_reason(
     frames = {frame.frame: frame for frame in client.frames(job)}
     assert frames[2].state == "failed"
     assert "cloud.0002.vdb" in (frames[2].reason or "")
+
+
+def test_the_commands_list_all_jobs_hurry_one_and_delete_them(
+    client: Client,
+    farm: EmbeddedFarm,
+    shot: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def command(*words: str) -> list[str]:
+        """The lines that are told, after those of the service, which is in this process."""
+        ended = CliRunner().invoke(app, [*words, "--server", farm.url])
+        assert ended.exit_code == 0, ended.output
+        return ended.output.splitlines()
+
+    # Their caches never come, so that nothing happens to them meanwhile.
+    sent = [
+        client.submit(Shot.model_validate(shot), wait_for_caches=True).job.id
+        for _ in range(NEWEST + 1)
+    ]
+    monkeypatch.setattr("pileus_service.client.PAGE", 40)
+    assert {job["id"] for job in json.loads(command("list", "--json")[-1])} == {*sent}
+    listed = command("list")
+    assert sum(job in "\n".join(listed) for job in sent) == NEWEST
+    assert "more than these" in listed[-1]
+    assert command("priority", sent[0], "9")[-1] == f"{sent[0]}: priority 9"
+    assert client.job(sent[0]).priority == 9
+    command("delete", *sent)
+    assert not [*client.jobs()]
+    assert not [*Store(tmp_path / "farm").folders()]
 
 
 def test_the_embedded_farm_ends_cleanly_on_ctrl_c(tmp_path: Path) -> None:

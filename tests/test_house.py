@@ -1,13 +1,16 @@
 """The house's rules that a reviewer would otherwise have to keep in mind."""
 
 import ast
+import importlib
 import pickle
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
+from typer.main import get_command
 
 from pileus_service.jobs import Cause, Merged, Planned, Rendered, Replan, Stale, Waiting
 from pileus_worker import supervisor
@@ -43,6 +46,17 @@ main()
     assert "pileus_core" in ended.stderr
     assert "pip install" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_every_command_is_one_of_the_program() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    listed = project["entry-points"]["pileus.commands"]
+    for place in set(listed.values()):
+        app = importlib.import_module(place.removesuffix(":app")).app
+        command = get_command(app)
+        family = {} if app.info.name else getattr(command, "commands", {})
+        made = set(family) or {command.name}
+        assert made == {name for name, source in listed.items() if source == place}
 
 
 def test_nothing_that_a_client_sends_can_become_code() -> None:

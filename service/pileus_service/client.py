@@ -17,6 +17,7 @@ from pileus_service.messages import Accepted, Submission
 from pileus_service.shot import Shot
 
 M = TypeVar("M", bound=BaseModel)
+PAGE = 1000
 
 
 class Client:
@@ -59,24 +60,15 @@ class Client:
         answer = self._ask("POST", "/jobs", json=body.model_dump(mode="json"), headers=headers)
         return Accepted.model_validate_json(answer.content)
 
-    def jobs(self, limit: int = 100) -> list[JobView]:
-        answer = self._ask("GET", "/jobs", params={"limit": limit})
-        return TypeAdapter(list[JobView]).validate_json(answer.content)
+    def jobs(self) -> Iterator[JobView]:
+        """All of them, the newest first."""
+        return self._pages("/jobs", TypeAdapter(list[JobView]))
 
     def job(self, job: str) -> JobView:
         return JobView.model_validate_json(self._ask("GET", f"/jobs/{job}").content)
 
     def frames(self, job: str) -> Iterator[FrameView]:
-        offset = 0
-        while True:
-            answer = self._ask(
-                "GET", f"/jobs/{job}/frames", params={"limit": 1000, "offset": offset}
-            )
-            page = TypeAdapter(list[FrameView]).validate_json(answer.content)
-            yield from page
-            if len(page) < 1000:
-                return
-            offset += len(page)
+        return self._pages(f"/jobs/{job}/frames", TypeAdapter(list[FrameView]))
 
     def frame(self, job: str, index: int) -> FrameView:
         """One frame, by its place in the job."""
@@ -94,6 +86,13 @@ class Client:
 
     def control(self, job: str, verb: str) -> JobView:
         return JobView.model_validate_json(self._ask("POST", f"/jobs/{job}/{verb}").content)
+
+    def set_priority(self, job: str, priority: int) -> JobView:
+        answer = self._ask("PATCH", f"/jobs/{job}", json={"priority": priority})
+        return JobView.model_validate_json(answer.content)
+
+    def delete(self, job: str) -> None:
+        self._ask("DELETE", f"/jobs/{job}")
 
     def drain(self, worker: str, *, undo: bool = False) -> None:
         self._ask("POST", f"/workers/{quote(worker, safe='')}/{'undrain' if undo else 'drain'}")
@@ -119,6 +118,16 @@ class Client:
             if view.state in TERMINAL:
                 return
             time.sleep(0.5)
+
+    def _pages(self, path: str, page: TypeAdapter[list[M]]) -> Iterator[M]:
+        offset = 0
+        while True:
+            answer = self._ask("GET", path, params={"limit": PAGE, "offset": offset})
+            things = page.validate_json(answer.content)
+            yield from things
+            if len(things) < PAGE:
+                return
+            offset += PAGE
 
     def _ask(self, verb: str, path: str, **more: Any) -> httpx.Response:
         try:

@@ -148,7 +148,7 @@ def _data(data: Path) -> Iterator[Finding]:
         "warning",
         "data folder's room",
         f"{free / (1 << 30):.1f} GiB free",
-        "make room: partial images wait there until their frame is merged",
+        "make room: `pileus delete` removes what is left of jobs that have ended",
     )
 
 

@@ -1,8 +1,9 @@
 """The commands that ask a farm's service: submit, list, status, log, cancel, pause, resume, retry,
-workers, drain."""
+priority, delete, workers, drain."""
 
 import json
 import sys
+from itertools import islice
 from typing import Annotated, Any, Literal
 
 import typer
@@ -19,6 +20,7 @@ from pileus_service.watching import picture, show_until_ended, wait_for
 
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.")]
 LOCAL = f"http://{LISTEN}"
+NEWEST = 100  # as many as a person looks through
 
 app = typer.Typer()
 
@@ -64,11 +66,13 @@ def submit(
 def list_jobs(server: Server = LOCAL, token: Token = None, as_json: AsJson = False) -> None:
     """Lists the jobs, the newest first."""
     with Client(server, token) as client:
-        jobs = client.jobs()
+        jobs = [*islice(client.jobs(), None if as_json else NEWEST + 1)]
     if as_json:
         _print_json(jobs)
         return
-    Console().print(terminal.job_table(jobs))
+    Console().print(terminal.job_table(jobs[:NEWEST]))
+    if len(jobs) > NEWEST:
+        print(f"There are more than these {NEWEST}: --json lists all", file=sys.stderr)
 
 
 @app.command()
@@ -131,6 +135,38 @@ _verb("cancel", "Stops a job for good.")
 _verb("pause", "Stops a job's work until it is resumed.")
 _verb("resume", "Lets a paused job go on.")
 _verb("retry", "Renders the failed frames of a job again, and no others.")
+
+
+@app.command("priority")
+def set_priority(
+    job: JobArgument,
+    priority: Annotated[
+        int, typer.Argument(metavar="N", min=0, max=9, help="The higher the sooner.")
+    ],
+    server: Server = LOCAL,
+    token: Token = None,
+    as_json: AsJson = False,
+) -> None:
+    """Changes how urgent a job is."""
+    with Client(server, token) as client:
+        view = client.set_priority(job, priority)
+    if as_json:
+        _print_json(view)
+    else:
+        print(f"{view.id}: priority {view.priority}")
+
+
+@app.command()
+def delete(
+    jobs: Annotated[list[str], typer.Argument(metavar="JOB...", help="The jobs' ids.")],
+    server: Server = LOCAL,
+    token: Token = None,
+) -> None:
+    """Stops jobs and removes what the data folder has of them; their images stay."""
+    with Client(server, token) as client:
+        for job in jobs:
+            client.delete(job)
+            print(f"{job}: deleted")
 
 
 @app.command()
