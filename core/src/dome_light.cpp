@@ -161,7 +161,7 @@ std::unique_ptr<const Light> make_dome_light(const Color& radiance, const std::s
     texels.reserve(image.values.size() / static_cast<std::size_t>(channels));
     for (auto value = image.values.begin(); value != image.values.end(); value += channels) {
         Color color =
-            radiance * Color(value[0], value[channels > 1 ? 1 : 0], value[channels > 2 ? 2 : 0]);
+            radiance * (channels == 3 ? Color(value[0], value[1], value[2]) : Color(value[0]));
         for (int c = 0; c < 3; ++c) {
             if (color[c] > most_radiance && std::isfinite(color[c])) {
                 color[c] = most_radiance;

@@ -7,13 +7,14 @@
 
 namespace pileus {
 
-/// Pixels row by row from the top, `channels` values each, at most three.
+/// Pixels row by row from the top, `channels` values each: 1, grey, or 3.
 struct Texture {
     int width = 0, height = 0, channels = 0;
     std::vector<float> values;
 };
 
-/// Reads an image of at most 2^28 pixels. Throws InputError, naming the file.
+/// Reads a plain image of at most 2^28 pixels, without its alpha. Throws InputError, naming the
+/// file.
 Texture read_texture(const std::string& path);
 
 }  // namespace pileus

@@ -3,7 +3,6 @@
 
 #include <OpenImageIO/imageio.h>
 
-#include <algorithm>
 #include <cstdint>
 
 /// Reads into `texture`, or says in `trouble` why it cannot: exceptions must not cross the border.
@@ -20,7 +19,12 @@ extern "C" void pileus_read_texture(const std::string& path, pileus::Texture& te
         trouble = "is not a lat-long image of at most 2^28 pixels";
         return;
     }
-    texture = {spec.width, spec.height, std::min(spec.nchannels, 3), {}};
+    if (spec.depth > 1 || spec.deep) {
+        trouble = "is a volume or has deep pixels; a sky is a plain image";
+        return;
+    }
+    // What is not RGB is grey, perhaps with an alpha.
+    texture = {spec.width, spec.height, spec.nchannels < 3 ? 1 : 3, {}};
     texture.values.resize(static_cast<std::size_t>(spec.width) *
                           static_cast<std::size_t>(spec.height) *
                           static_cast<std::size_t>(texture.channels));
