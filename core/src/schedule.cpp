@@ -4,13 +4,13 @@
 
 namespace pileus {
 
-Schedule::Schedule(const Medium& medium) : media_{medium}, order_{0.0f} {}
+Schedule::Schedule(const Medium& medium) : own_(&medium), media_{medium}, order_{0.0f} {}
 
 // Each event from there on stands for twice as many as the one before it, 1 - g doubling, until
 // scattering is isotropic. Light that a reduced medium lets through unscattered has in truth been
 // scattered forward on its way; so the shadow rays of event `from` - 1 cross the first reduced
 // medium already, as the flight from it does, or that light would be lost.
-Schedule::Schedule(const Medium& medium, int from) : media_{medium}, order_{0.0f} {
+Schedule::Schedule(const Medium& medium, int from) : own_(&medium), media_{medium}, order_{0.0f} {
     const float g = medium.phase().g();
     if (g <= 0.0f) return;
     plain_ = from;

@@ -21,7 +21,7 @@ class Schedule {
     Schedule(const Medium& medium, int from);
 
     /// The medium whose particles event n meets: its phase function and albedo are the event's.
-    const Medium& at(int n) const { return n == 0 ? media_.front() : onward(n - 1); }
+    const Medium& at(int n) const { return n == 0 ? *own_ : onward(n - 1); }
 
     /// The medium that light crosses beyond event n, towards the next event and the lights.
     const Medium& onward(int n) const { return media_[index(n)]; }
@@ -44,6 +44,7 @@ class Schedule {
         return std::min(static_cast<std::size_t>(n), media_.size() - 1);
     }
 
+    const Medium* own_;
     std::vector<Medium> media_;  // beyond each event; the last for all further ones
     std::vector<float> order_;   // of each event; further ones follow at a steady pace
     float pace_ = 1.0f;

@@ -27,11 +27,20 @@ Scene cube(const Color& albedo, float g, float sun_angle = 0.0f) {
 
 TEST(Schedule, KeepsAbsorptionAndReducedScattering) {
     const V3f middle((V3f(cube_volume()->tree().low()) + V3f(cube_volume()->tree().high())) * 0.5f);
-    for (const float g : {0.1f, 0.5f, 0.85f, 0.999f}) {
+    for (const auto& [g, from] : {std::pair{0.1f, 3},
+                                  {0.5f, 3},
+                                  {0.85f, 1},
+                                  {0.85f, 2},
+                                  {0.85f, 3},
+                                  {0.85f, 20},
+                                  {0.999f, 3}}) {
         const Medium medium(*cube_volume(), 12.0f, Color(0.9f, 0.7f, 0.99f), g);
-        constexpr int from = 3;
         const Schedule schedule(medium, from);
-        for (int n = 0; n < from; ++n) EXPECT_EQ(schedule.at(n).phase().g(), g);
+        EXPECT_EQ(schedule.plain(), from);
+        for (int n = 0; n < from; ++n) {
+            EXPECT_EQ(schedule.at(n).phase().g(), g);
+            EXPECT_EQ(schedule.order(n), n);
+        }
         EXPECT_LT(schedule.at(from).phase().g(), g);
         EXPECT_EQ(schedule.at(40).phase().g(), 0.0f);
         const float sigma = medium.extinction(middle);
