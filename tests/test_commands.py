@@ -1,6 +1,7 @@
 """The commands that need no farm: what they write, what they refuse, how they end."""
 
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -123,6 +124,20 @@ def test_make_writes_a_sequence(tmp_path: Path) -> None:
     assert "greater --length" in refused(
         pileus("make", "cloud", tmp_path / "a.vdb", "--frames", "3", "--length", "2")
     )
+
+
+def test_a_cache_that_does_not_fit_on_the_disk_is_not_there_at_all(tmp_path: Path) -> None:
+    def full() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20480, 20480))
+
+    command = [PILEUS, "make", "cloud", str(tmp_path / "cloud.vdb"), "--frames", "1"]
+    ended = subprocess.run(
+        [*command, "--resolution", "64"], capture_output=True, text=True, preexec_fn=full
+    )
+    assert ended.returncode == 1
+    assert ended.stderr.count("\n") == 1
+    assert "cannot be written (File too large)" in ended.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_compare_tells_the_error_as_it_is_defined(shot_file: Path, tmp_path: Path) -> None:

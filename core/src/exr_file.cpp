@@ -2,6 +2,7 @@
 
 #include "error.h"
 #include "printable.h"
+#include "whole_file.h"
 
 #include <OpenEXR/ImfChannelList.h>
 #include <OpenEXR/ImfFloatAttribute.h>
@@ -19,11 +20,7 @@
 #include <OpenEXR/ImfTestFile.h>
 
 #include <algorithm>
-#include <cerrno>
-#include <cstring>
-#include <fcntl.h>
 #include <filesystem>
-#include <unistd.h>
 
 namespace pileus {
 
@@ -113,40 +110,6 @@ void write_parts(const std::string& path, const LayeredImage& image, int width, 
     }
 }
 
-/// A file that was not there before: no link that somebody laid in its place is followed.
-class NewFile {
-  public:
-    explicit NewFile(const std::string& path) {
-        constexpr int flags = O_RDWR | O_CREAT | O_EXCL | O_NOFOLLOW | O_CLOEXEC;
-        file_ = ::open(path.c_str(), flags, 0666);
-        if (file_ < 0 && errno == EEXIST) {  // left by an earlier process of our number
-            ::unlink(path.c_str());
-            file_ = ::open(path.c_str(), flags, 0666);
-        }
-        if (file_ < 0) throw std::runtime_error(std::strerror(errno));
-    }
-    NewFile(const NewFile&) = delete;
-    NewFile& operator=(const NewFile&) = delete;
-    ~NewFile() { ::close(file_); }
-
-    /// Leads to this very file.
-    std::string location() const { return "/proc/self/fd/" + std::to_string(file_); }
-    void sync() const {
-        if (::fsync(file_) != 0) throw std::runtime_error(std::strerror(errno));
-    }
-
-  private:
-    int file_;
-};
-
-void sync_folder(const std::string& path) {
-    const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
-    const bool synced = file >= 0 && ::fsync(file) == 0;
-    const int reason = errno;
-    if (file >= 0) ::close(file);
-    if (!synced) throw std::runtime_error(std::strerror(reason));
-}
-
 }  // namespace
 
 LayeredImage::LayeredImage(const Bucket& window, std::vector<std::string> looks,
@@ -164,16 +127,11 @@ std::size_t LayeredImage::look_index(const std::string& name) const {
 
 void write_exr(const std::string& path, const LayeredImage& image, int width, int height, bool half,
                const Header& header) {
-    const std::string temporary = path + "." + std::to_string(::getpid()) + ".tmp";
     try {
-        const NewFile file(temporary);
+        WholeFile file(path);
         write_parts(file.location(), image, width, height, half, header);
-        file.sync();
-        std::filesystem::rename(temporary, path);
-        sync_folder(std::filesystem::absolute(path).parent_path().string());
+        file.keep();
     } catch (const std::exception& error) {
-        std::error_code ignored;
-        std::filesystem::remove(temporary, ignored);
         throw std::runtime_error(path + ": cannot be written (" + error.what() + ")");
     }
 }

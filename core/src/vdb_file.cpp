@@ -1,37 +1,47 @@
 #include "vdb_file.h"
 
 #include "error.h"
+#include "whole_file.h"
 
-#include <openvdb/io/File.h>
+#include <openvdb/io/Archive.h>
 #include <openvdb/tools/Dense.h>
 
+#include <cerrno>
 #include <cmath>
-#include <filesystem>
-#include <system_error>
-#include <unistd.h>
+#include <cstring>
+#include <fstream>
 
 namespace pileus {
 
-namespace fs = std::filesystem;
+namespace {
+
+/// OpenVDB's own file writer does not notice that a disk is full.
+class VdbWriter : public openvdb::io::Archive {
+  public:
+    void write_to(std::ostream& stream, const openvdb::GridCPtrVec& grids,
+                  const openvdb::MetaMap& metadata) const {
+        write(stream, grids, /*seekable=*/true, metadata);
+    }
+};
+
+}  // namespace
 
 void write_vdb(const std::string& path, const openvdb::GridCPtrVec& grids,
                const openvdb::MetaMap& metadata) {
-    const std::string temporary = path + "." + std::to_string(::getpid()) + ".tmp";
-    std::error_code ignored;
+    const auto refuse = [&](const char* reason) {
+        return std::runtime_error(path + ": cannot be written (" + reason + ")");
+    };
     try {
-        openvdb::io::File file(temporary);
-        file.write(grids, metadata);
-        file.close();
-        fs::rename(temporary, path);
-    } catch (const fs::filesystem_error& error) {
-        fs::remove(temporary, ignored);
-        throw std::runtime_error(path + ": cannot be written: " + error.code().message());
-    } catch (const std::exception&) {
-        fs::remove(temporary, ignored);
-        const fs::path folder = fs::path(path).parent_path();
-        const bool missing = !folder.empty() && !fs::is_directory(folder, ignored);
-        throw std::runtime_error(path + ": cannot be written: " +
-                                 (missing ? "no such folder" : "the folder refuses it or is full"));
+        WholeFile file(path);
+        std::ofstream stream(file.location(), std::ios::binary);
+        stream.exceptions(std::ios::failbit | std::ios::badbit);
+        VdbWriter().write_to(stream, grids, metadata);
+        stream.close();
+        file.keep();
+    } catch (const std::ios::failure&) {
+        throw refuse(std::strerror(errno));
+    } catch (const std::exception& error) {
+        throw refuse(error.what());
     }
 }
 

@@ -11,8 +11,7 @@
 
 namespace pileus {
 
-/// Writes to a temporary name beside `path` and renames, so that a reader meets all or nothing.
-/// Throws std::runtime_error, one line that names the path.
+/// Writes whole or not at all. Throws std::runtime_error, one line that names the path.
 void write_vdb(const std::string& path, const openvdb::GridCPtrVec& grids,
                const openvdb::MetaMap& metadata = {});
 

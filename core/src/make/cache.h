@@ -33,8 +33,7 @@ class Cache {
         insert(leaves);
     }
 
-    // Writes to a temporary name beside `path` and renames, so a reader meets all or nothing.
-    // Returns the number of active voxels. Throws std::runtime_error naming the path.
+    // Writes whole or not at all. Returns the number of active voxels. Throws std::runtime_error naming the path.
     std::int64_t write(const std::string& path, const MakeOptions& options,
                        const std::string& creator);
 
