@@ -26,10 +26,10 @@ V3i to_v3i(const Coord& c) { return {c.x(), c.y(), c.z()}; }
 /// The bits of a density as the renderer takes it: what it cannot be becomes zero. Positive floats
 /// order like their bits, so this and what follows is integer arithmetic that vectorizes on any
 /// machine.
-constexpr std::int32_t density_bits(float value, std::int32_t background) {
+constexpr std::int32_t density_bits(float value) {
     constexpr std::int32_t infinity = 0x7f800000;
     const auto bits = std::bit_cast<std::int32_t>(value);
-    return bits > 0 && bits < infinity && bits != background ? bits : 0;
+    return bits > 0 && bits < infinity ? bits : 0;
 }
 
 struct Scan {
@@ -38,12 +38,12 @@ struct Scan {
 };
 
 template <class Value>
-PILEUS_DISPATCH Scan scan(const Value* values, int count, std::int32_t background) {
+PILEUS_DISPATCH Scan scan(const Value* values, int count) {
     constexpr std::int32_t infinity = 0x7f800000;
     std::int32_t max = 0, odd = 0;
     for (int i = 0; i < count; ++i) {
         const auto value = static_cast<float>(values[i]);
-        const std::int32_t density = density_bits(value, background);
+        const std::int32_t density = density_bits(value);
         max = density > max ? density : max;
         const auto bits = std::bit_cast<std::int32_t>(value);
         odd |= (bits < 0 || bits >= infinity) ? 1 : 0;
@@ -53,15 +53,38 @@ PILEUS_DISPATCH Scan scan(const Value* values, int count, std::int32_t backgroun
 
 /// Halves of densities / scale. Two factors, for 2^-112 / scale may be too small for a float.
 template <class Value>
-PILEUS_DISPATCH void encode(const Value* values, int count, std::int32_t background,
-                            float inverse_scale, Half* halves) {
+PILEUS_DISPATCH void encode(const Value* values, int count, float inverse_scale, Half* halves) {
     for (int i = 0; i < count; ++i) {
-        const float density =
-            std::bit_cast<float>(density_bits(static_cast<float>(values[i]), background));
+        const float density = std::bit_cast<float>(density_bits(static_cast<float>(values[i])));
         const auto bits = std::bit_cast<std::uint32_t>(density * inverse_scale * 0x1p-112f);
         halves[i] = static_cast<Half>((bits + 0xfffu + ((bits >> 13) & 1u)) >> 13);
     }
 }
+
+/// A leaf's voxels as they are stored, but for those of the background, which are not: one that is
+/// not zero would fill all space, and a density that is not zero there is not one.
+template <class Leaf>
+class StoredValues {
+  public:
+    using Value = typename Leaf::ValueType;
+
+    StoredValues(const Leaf& leaf, Value background) : values_(leaf.buffer().data()) {
+        if (background == Value(0)) return;
+        for (openvdb::Index i = 0; i < Leaf::SIZE; ++i) {
+            const bool stored = leaf.isValueOn(i) || values_[i] != background;
+            cleared_[i] = stored ? values_[i] : Value(0);
+        }
+        values_ = cleared_.data();
+    }
+    StoredValues(const StoredValues&) = delete;
+    StoredValues& operator=(const StoredValues&) = delete;
+
+    const Value* data() const { return values_; }
+
+  private:
+    const Value* values_;
+    std::array<Value, Leaf::SIZE> cleared_;
+};
 
 template <class Value>
 void count(Value value, std::int64_t times, Census& census) {
@@ -284,14 +307,14 @@ namespace {
 
 /// Tiles above the leaves that hold something.
 template <class Tree>
-auto collect_tiles(const Tree& tree, std::int32_t background, Census& census) {
+auto collect_tiles(const Tree& tree, Census& census) {
     std::vector<Tile> tiles;
     auto it = tree.cbeginValueAll();
     it.setMaxDepth(Tree::ValueAllCIter::LEAF_DEPTH - 1);
     for (; it; ++it) {
         if (it.isValueOn()) count(*it, static_cast<std::int64_t>(it.getVoxelCount()), census);
-        const std::int32_t bits = density_bits(static_cast<float>(*it), background);
-        if (bits == 0) continue;
+        const std::int32_t bits = density_bits(static_cast<float>(*it));
+        if (bits == 0 || (!it.isValueOn() && *it == tree.background())) continue;
         CoordBBox box;
         it.getBoundingBox(box);
         tiles.push_back({box, std::bit_cast<float>(bits)});
@@ -306,10 +329,7 @@ BuiltTree build(const Tree& tree) {
     static_assert(Leaf::DIM == BrickTree::width);
 
     BuiltTree built;
-    // A value outside the stored region would fill all space; a density that is not zero there is
-    // not one.
-    const auto background = std::bit_cast<std::int32_t>(static_cast<float>(tree.background()));
-    const auto tiles = collect_tiles(tree, background, built.census);
+    const auto tiles = collect_tiles(tree, built.census);
     std::vector<const Leaf*> leaves;
     tree.getNodes(leaves);
 
@@ -319,7 +339,8 @@ BuiltTree build(const Tree& tree) {
         LeafRange(0, leaves.size()), Census{},
         [&](const LeafRange& range, Census census) {
             for (std::size_t l = range.begin(); l != range.end(); ++l) {
-                const Scan found = scan(leaves[l]->buffer().data(), Leaf::SIZE, background);
+                const StoredValues values(*leaves[l], tree.background());
+                const Scan found = scan(values.data(), Leaf::SIZE);
                 greatest[l] = found.max;
                 if (!found.odd) continue;
                 for (auto it = leaves[l]->cbeginValueOn(); it; ++it) count(*it, 1, census);
@@ -364,8 +385,8 @@ BuiltTree build(const Tree& tree) {
     const float inverse_scale = 1.0f / builder.scale();
     tbb::parallel_for(LeafRange(0, leaves.size()), [&](const LeafRange& range) {
         for (std::size_t l = range.begin(); l != range.end(); ++l) {
-            encode(leaves[l]->buffer().data(), Leaf::SIZE, background, inverse_scale,
-                   builder.brick(l).data());
+            const StoredValues values(*leaves[l], tree.background());
+            encode(values.data(), Leaf::SIZE, inverse_scale, builder.brick(l).data());
             builder.measure(l);
         }
     });

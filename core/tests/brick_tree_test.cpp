@@ -277,6 +277,20 @@ TEST(BrickTree, CountsWhatCannotBeADensityAndTakesItAsZero) {
     EXPECT_EQ(built.tree.max(), 1.0f);
 }
 
+TEST(BrickTree, OfABackgroundThatIsNotZeroOnlyWhatIsStoredIsDensity) {
+    const auto grid = openvdb::FloatGrid::create(1.0f);
+    auto& tree = grid->tree();
+    tree.setValue(Coord(0), 1.0f);  // as the background, but stored
+    tree.setValue(Coord(1, 0, 0), 0.5f);
+    tree.addTile(1, Coord(16, 0, 0), 1.0f, true);
+    tree.addTile(1, Coord(24, 0, 0), 1.0f, false);
+    const BuiltTree built = build_brick_tree(tree);
+    for (int x = -1; x < 40; ++x) {
+        const float stored = x == 1 ? 0.5f : x == 0 || (x >= 16 && x < 24) ? 1.0f : 0.0f;
+        EXPECT_EQ(built.tree.voxel(V3i(x, 0, 0) - built.origin), stored) << x;
+    }
+}
+
 TEST(BrickTree, GridsThatHoldNothingAreEmpty) {
     const auto grid = empty_grid();
     EXPECT_TRUE(build_brick_tree(grid->tree()).tree.empty());
