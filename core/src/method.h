@@ -44,6 +44,9 @@ class Method {
     /// to the record. All that is given, and the method, must outlive the path.
     virtual Path trace(const CameraRay& ray, const PathRandom& random, PathRecord& record,
                        PathKit& kit) = 0;
+
+    /// Of how many orders a path may ask for the light at one time.
+    virtual int orders_at_once() const { return 1; }
 };
 
 /// The names a transport may have, in the order of the table in docs/methods.md.

@@ -59,9 +59,8 @@ class Stream {
           method_(make_method(work.scene, work.transport)),
           tracker_(work.scene.volume->tree(), work.scene.medium.boxes()),
           kits_(std::clamp<std::size_t>(
-                    (std::size_t{1} << 16) /
-                        (work.transport.looks.size() *
-                         static_cast<std::size_t>(work.transport.max_bounces.value_or(1))),
+                    (std::size_t{1} << 16) / (work.transport.looks.size() *
+                                              static_cast<std::size_t>(method_->orders_at_once())),
                     1, in_flight),
                 PathKit(tracker_, work.scene.lights.size())),
           paths_(kits_.size()),

@@ -27,6 +27,8 @@ class Contrast final : public Method {
         kit.shadows.settle(record);
     }
 
+    int orders_at_once() const override { return octaves_; }
+
   private:
     const Scene& scene_;
     int octaves_;
