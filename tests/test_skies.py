@@ -52,5 +52,5 @@ def test_a_volume_of_pixels_is_no_sky(tmp_path: Path) -> None:
     texture.write_bytes(
         header + pixel + struct.pack("<5I", caps, volume, 0, 0, 0) + bytes(side * side * depth * 4)
     )
-    with pytest.raises(core.InputError, match="sky.dds: is a volume"):
+    with pytest.raises(core.InputError, match=r"sky\.dds: is a volume"):
         core.DomeLight(radiance=(1.0, 1.0, 1.0), texture=str(texture))

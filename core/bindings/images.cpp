@@ -89,7 +89,7 @@ void bind_partial_and_frame(nb::module_& m) {
         .def_rw("unmet", &Partial::unmet,
                 "It has had all the samples it may have, and misses its share of the tolerance.")
         .def(
-            "relative_error", &Partial::relative_error,
+            "relative_error", &Partial::relative_error, nb::call_guard<nb::gil_scoped_release>(),
             "The RMS relative error of its pixels for their noise, one standard error more than it "
             "seems to be.")
         .def(
@@ -167,7 +167,7 @@ void bind_partial_and_frame(nb::module_& m) {
             "it cannot be written.")
         .def_prop_ro("mean_samples", &Frame::mean_samples,
                      "Samples a pixel, over those that have all of theirs.")
-        .def("relative_error", &Frame::relative_error,
+        .def("relative_error", &Frame::relative_error, nb::call_guard<nb::gil_scoped_release>(),
              "The RMS relative error of the pixels, from their variances.")
         .def_prop_ro("bounded_paths", &Frame::bounded_paths,
                      "Paths that the bound on work has ended, of all partials.")
@@ -199,7 +199,10 @@ void bind_read_image(nb::module_& m) {
     m.def(
         "read_image",
         [](const std::string& path) {
-            const ExrFile file = read_exr(path);
+            const ExrFile file = [&] {
+                const nb::gil_scoped_release release;
+                return read_exr(path);
+            }();
             std::map<std::string, std::map<std::string, Pixels>> result;
             for (std::size_t look = 0; look < file.image.looks().size(); ++look) {
                 result.emplace(file.image.looks()[look], channels_of(file.image, look));

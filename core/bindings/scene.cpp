@@ -101,6 +101,7 @@ void bind_camera_and_lights(nb::module_& m) {
             "__init__",
             [](DomeLightHandle* self, const Triple& radiance, const std::string& texture) {
                 std::vector<std::string> warnings;
+                const nb::gil_scoped_release release;
                 auto light = make_dome_light(to_light("radiance", radiance), texture, warnings);
                 new (self) DomeLightHandle{{std::move(light), std::move(warnings)}};
             },

@@ -1,7 +1,7 @@
 // A volume as light meets it: extinction, albedo and phase function over a density field. Every
-// medium answers two questions, the extinction at a point and the majorants along a ray; all
-// tracking is written over these (the arrangement of pbrt-v4's media, Pharr, Jakob & Humphreys
-// 2023).
+// medium answers two questions, the extinction at a point and the majorants along a ray (the
+// arrangement of pbrt-v4's media, Pharr, Jakob & Humphreys 2023). The march asks them; the lanes of
+// tracker_lanes.inc find the same many at once.
 #pragma once
 
 #include "majorants.h"
@@ -16,11 +16,7 @@ class Medium {
   public:
     /// `extinction` is sigma_t at density 1, per world unit. The volume must outlive the medium.
     Medium(const Volume& volume, float extinction, const Color& albedo, float anisotropy)
-        : volume_(&volume),
-          tree_(&volume.tree()),
-          extinction_(extinction),
-          albedo_(albedo),
-          phase_(anisotropy) {
+        : tree_(&volume.tree()), extinction_(extinction), albedo_(albedo), phase_(anisotropy) {
         const Imath::M44d& m = volume.world_to_local();
         for (int row = 0; row < 3; ++row) {
             for (int column = 0; column < 3; ++column) {
@@ -48,7 +44,6 @@ class Medium {
         return result;
     }
 
-    const Volume& volume() const { return *volume_; }
     const Color& albedo() const { return albedo_; }
     const HenyeyGreenstein& phase() const { return phase_; }
 
@@ -58,14 +53,6 @@ class Medium {
     /// A ray from a local position along a unit vector of the world.
     LocalRay ray(const V3f& local_position, const V3f& world_direction) const {
         return {local_position, world_direction * to_local_};
-    }
-
-    /// Whether a local position lies in the box around everything stored. Not so for NaN and
-    /// infinities.
-    bool inside(const V3f& x) const {
-        const V3f low(tree_->low()), high(tree_->high());
-        return x.x >= low.x && x.y >= low.y && x.z >= low.z && x.x < high.x && x.y < high.y &&
-               x.z < high.z;
     }
 
     /// sigma_t at a local position inside the box: one interpolated voxel.
@@ -96,7 +83,6 @@ class Medium {
     /// the work along a ray, and its steps in float, bounded.
     float bounded(float density) const { return std::min(extinction_ * density, thickest_); }
 
-    const Volume* volume_;
     const BrickTree* tree_;
     float extinction_;
     float thickest_ = 0.0f;

@@ -5,7 +5,6 @@
 
 #include <array>
 #include <bit>
-#include <cmath>
 #include <cstdint>
 #include <cstring>
 
@@ -25,9 +24,6 @@ constexpr std::uint64_t hash_key(std::uint64_t key, std::uint64_t word) {
 
 /// The 24 high bits of a word as a float in [0, 1).
 constexpr float unit_float(std::uint32_t bits) { return static_cast<float>(bits >> 8) * 0x1p-24f; }
-
-/// The exponential distribution with mean 1, inverted; finite for u in [0, 1).
-inline float exponential(float u) { return -std::log(1.0f - u); }
 
 /// A stream of random numbers: the n-th is a function of (key, n).
 class Random {

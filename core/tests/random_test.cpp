@@ -140,20 +140,5 @@ TEST(RandomStreams, SobolPointsOfDifferentPixelsAreIndependent) {
     }
 }
 
-TEST(RandomStreams, ExponentialsHaveTheirDistribution) {
-    Random random(3);
-    constexpr int count = 200000, bins = 64;
-    std::vector<int> histogram(bins);
-    for (int i = 0; i < count; ++i) {
-        const float value = exponential(random.uniform());
-        ASSERT_TRUE(std::isfinite(value) && value >= 0.0f);
-        ++histogram[std::min<std::size_t>(bins - 1, std::size_t(-std::expm1(-value) * bins))];
-    }
-    double chi_square = 0.0;
-    const double expected = double(count) / bins;
-    for (const int n : histogram) chi_square += (n - expected) * (n - expected) / expected;
-    EXPECT_LT(chi_square, test::chi_square_limit(0.9999, bins - 1));
-}
-
 }  // namespace
 }  // namespace pileus

@@ -33,7 +33,8 @@ class Cache {
         insert(leaves);
     }
 
-    // Writes whole or not at all. Returns the number of active voxels. Throws std::runtime_error naming the path.
+    // Writes whole or not at all. Returns the number of active voxels. Throws std::runtime_error
+    // naming the path.
     std::int64_t write(const std::string& path, const MakeOptions& options,
                        const std::string& creator);
 
