@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from pileus_bench import promise
 from pileus_bench.here import ready
 from pileus_bench.measures import error
 from pileus_bench.scenes import SHARED, scene_names
+from pileus_service.jobs import Resolved
 from pileus_service.shot import Shot
 from pileus_worker import deciding, scene
-from pileus_worker.deciding import PILOT_ORDERS, Measure, decide
+from pileus_worker.deciding import PILOT_ORDERS, Measure, Seen, decide
 from pileus_worker.sampling import Sampler
 
 SIZE = 48
@@ -74,20 +76,55 @@ def test_the_tolerance_is_kept_by_the_smallest_model(
     field = core.Volume(str(cache))
     wanted = auto(shot, cache, tolerance, **volume)
     truth = red(wanted, field, core.Transport(method="reference", looks=[_beauty()]), 1024)
-    within = 0
+    for resolved in kept(wanted, field, truth):
+        assert resolved.method == method, resolved.reason
+        assert (resolved.max_bounces == 1) == (volume["extinction"] < 1), resolved.reason
+
+
+def kept(wanted: Shot, field: core.Volume, truth: Any) -> Iterator[Resolved]:
+    """What is decided with each seed; the tolerance is kept with all of them."""
     for seed in SEEDS:
         sampling = wanted.sampling.model_copy(update={"seed": seed})
         ours = wanted.model_copy(update={"sampling": sampling})
         control = core.Control()
         resolved = deciding.resolve(ours, 1, lambda: field, threads=0, control=control)
-        assert resolved.method == method, resolved.reason
-        assert (resolved.max_bounces == 1) == (volume["extinction"] < 1), resolved.reason
         view = scene.make_scene(ours, 1, field)
         sampler = Sampler(view, ours, resolved, frame=1, threads=0, control=control)
         image = sampler.whole().pixels("beauty")[..., 0]
         rms = math.sqrt(np.mean((image - truth) ** 2 / (truth**2 + 0.01)))
-        within += rms <= tolerance
-    assert within == len(SEEDS)
+        assert rms <= (ours.sampling.tolerance or 0.0), resolved.reason
+        yield resolved
+
+
+def test_where_similarity_errs_by_more_than_is_usual_the_pilot_sees_it(
+    shot: dict[str, Any], tmp_path: Path
+) -> None:
+    """Light that comes from behind through an even fog. Reduced from event 3 on it is 8 % too
+    much, where a cloud's errs by 3 %."""
+    cache = tmp_path / "fog.vdb"
+    side = 32
+    fog = np.ones((side, side, side), np.float32)
+    core.write_grid(str(cache), [((0, 0, 0), fog)], voxel=(1 / side,) * 3, origin=(-0.5,) * 3)
+    field = core.Volume(str(cache))
+    behind = {
+        "camera": {"position": [0, 0, 2], "look_at": [0, 0, 0], "fov": 35.0},
+        "lights": [{"type": "distant", "direction": [0, 0.2, 1], "irradiance": [3, 3, 3]}],
+    }
+    wanted = auto(shot | behind, cache, 0.1, extinction=6.0, anisotropy=0.6)
+
+    def brightness(method: str, **more: int) -> float:
+        transport = core.Transport(method=method, looks=[_beauty()], **more)
+        return float(red(wanted, field, transport, 256).mean())
+
+    truth = brightness("reference")
+    assert brightness("similarity", reduce_from=3) > 1.06 * truth
+    assert brightness("similarity", reduce_from=6) < 1.03 * truth
+    large = wanted.image.model_copy(update={"width": 4 * SIZE, "height": 4 * SIZE})
+    for seed in SEEDS:
+        sampling = wanted.sampling.model_copy(update={"seed": seed})
+        ours = wanted.model_copy(update={"sampling": sampling, "image": large})
+        resolved = deciding.resolve(ours, 1, lambda: field, threads=0, control=core.Control())
+        assert (resolved.method, resolved.reduce_from) == ("similarity", 6), resolved.reason
 
 
 @pytest.mark.slow
@@ -113,6 +150,10 @@ def _beauty() -> core.Look:
     return core.Look(name="beauty")
 
 
+def unseen(start: int) -> Seen:
+    return Seen(0.0, 0.0)
+
+
 @given(st.lists(st.floats(0.96, 1.04), min_size=2, max_size=12))
 def test_a_measure_that_wavers_about_a_limit_flips_nothing(wavering: list[float]) -> None:
     """Along a sequence the decision holds while the measure stays within a few per cent of where
@@ -136,7 +177,20 @@ def test_a_measure_that_wavers_about_a_limit_flips_nothing(wavering: list[float]
     quiet = 0.04
     at_quiet = (0.1 - quiet) / 2 * np.exp2(1.0 - orders)
     for tail, noise in ((at_single, math.inf), (at_seven, math.inf), (at_quiet, quiet)):
-        first = decide(shot, Measure(tail * wavering[0], noise=noise * wavering[0]))
+        first = decide(shot, Measure(tail * wavering[0], noise=noise * wavering[0]), unseen)
         for factor in wavering[1:]:
-            later = decide(shot, Measure(tail * factor, noise=noise * factor), first)
+            later = decide(shot, Measure(tail * factor, noise=noise * factor), unseen, first)
             assert (later.method, later.max_bounces) == (first.method, first.max_bounces)
+    # Three fifths of it may be similarity's bias, if the pilot sees that it is no less.
+    deep = Measure(np.full(PILOT_ORDERS + 1, 1.0))
+    for bias, spread in ((0.06, 0.0), (0.06, 0.03), (0.08, 0.038), (0.2, 0.158)):
+
+        def seen(factor: float, bias: float, spread: float) -> Callable[[int], Seen]:
+            return lambda start: (
+                Seen(bias * factor, spread * factor) if start < 6 else unseen(start)
+            )
+
+        first = decide(shot, deep, seen(wavering[0], bias, spread))
+        for factor in wavering[1:]:
+            later = decide(shot, deep, seen(factor, bias, spread), first)
+            assert later.reduce_from == first.reduce_from

@@ -9,6 +9,7 @@ so every machine decides alike.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pileus_core as core
@@ -20,13 +21,14 @@ from pileus_worker import scene
 
 PILOT_PIXELS = 1024
 FEWEST_PIXELS = 128
-PILOT_SHARE = 0.02  # of the pixel samples that the frame seems to need
+PILOT_SHARE = 0.0125  # of the pixel samples that the frame seems to need
 DENOISED_SHARE = 0.0625  # of that share, where the frame is denoised and will take far fewer
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
+BIAS_SHARE = 0.3  # of those: `reference`, which the bias is told by, takes several times as long
 BLOCK = 4
-# The RMS bias of `similarity` under a sun alone, by the event from which it reduces, as
-# docs/methods.md measures it; under a plain sky alone it was never seen to be over SKY_BIAS.
+# The RMS bias of `similarity` under a sun alone, by the event from which it reduces, as it usually
+# is (docs/methods.md); under a plain sky alone it was never seen to be over SKY_BIAS.
 SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
@@ -46,6 +48,14 @@ class Measure:
     noise: float = math.inf
 
 
+@dataclass(frozen=True)
+class Seen:
+    """A bias as a pilot sees it, relative, and the standard error of that."""
+
+    bias: float
+    error: float
+
+
 def resolve(
     shot: Shot,
     frame: int,
@@ -62,7 +72,7 @@ def resolve(
     if shot.sampling.tolerance is not None:
         pilot = Pilot(shot, frame, volume(), threads, control, reading)
         if asked.method == "auto":
-            return decide(shot, pilot.measure(), earlier)
+            return decide(shot, pilot.measure(), pilot.bias, earlier)
         opacity = pilot.opacity()
     depth = "the depth" if asked.max_bounces else "the method's own depth"
     return Resolved(
@@ -107,6 +117,7 @@ class Pilot:
         if image.denoise:
             self._share *= DENOISED_SHARE
         self._scene = scene.make_scene(small, frame, volume, reading)
+        self._bias_samples = 1
 
     def opacity(self) -> float:
         return _opacity(self._halves((0, 1)))
@@ -118,7 +129,8 @@ class Pilot:
         halves = self._halves((0, 1))
         noise = [half.relative_error() for half in halves]
         wanted = min((max(noise) / sampling.tolerance) ** 2, sampling.samples)
-        samples = int(min(max(1.0, self._share * wanted), PILOT_SAMPLES))
+        samples = _sensible(self._share * wanted)
+        self._bias_samples = _sensible(BIAS_SHARE * self._share * wanted)
         if samples > 1:
             for half, further in zip(halves, self._halves((1, samples)), strict=True):
                 half.pool(further)
@@ -128,18 +140,48 @@ class Pilot:
             tails.append(np.ones(PILOT_ORDERS + 1))  # of what was cut off nothing is known
         return Measure(np.max(tails, axis=0), _opacity(halves), sum(noise) / 2)
 
+    def bias(self, start: int) -> Seen:
+        """How far `similarity` from an event on errs: what all pixels of the volume have in common,
+        as an RMS relative error of the frame, of the look where it is greatest. It has the random
+        numbers of the truth, so that only what differs is noise."""
+        truth = self._truth
+        ours = self._pair("similarity", (0, self._bias_samples), start)
+        differ = np.stack([_wholes(a) - _wholes(b) for a, b in zip(ours, truth, strict=True)])
+        differ = differ.mean(axis=2)  # over RGB: of shape (halves, looks, pixels)
+        unlike = (differ[0] - differ[1]) / 2
+        error = np.sqrt((unlike**2).mean(-1) / unlike.shape[-1])
+        common = np.abs(differ.mean(axis=(0, 2)))
+        opacity = np.mean([half.pixels(half.looks[0])[..., 3].ravel() for half in truth], axis=0)
+        if not opacity.any():
+            return Seen(0.0, 0.0)
+        bright = np.mean([_wholes(half).mean(axis=1) @ opacity for half in truth], axis=0)
+        scale = np.sqrt(opacity.mean() * ((bright / opacity.sum()) ** 2 + 0.01))
+        worst = int(np.argmax(common / scale))
+        return Seen(float(common[worst] / scale[worst]), float(error[worst] / scale[worst]))
+
+    @cached_property
+    def _truth(self) -> tuple[core.Partial, core.Partial]:
+        return self._pair("reference", (0, self._bias_samples))
+
     def _halves(self, samples: tuple[int, int]) -> tuple[core.Partial, core.Partial]:
         """With each order of scattering for itself, and what comes after the last one."""
+        return self._pair("similarity", samples, orders=PILOT_ORDERS + 1)
+
+    def _pair(
+        self, method: str, samples: tuple[int, int], reduce_from: int = 3, orders: int = 0
+    ) -> tuple[core.Partial, core.Partial]:
+        looks = scene.make_looks(self._shot)
+        transport = core.Transport(method=method, looks=looks, reduce_from=reduce_from)
 
         def half(number: int) -> core.Partial:
             return core.render(
                 self._scene,
-                core.Transport(method="similarity", looks=scene.make_looks(self._shot)),
+                transport,
                 bucket=(0, 0, *self._size),
                 samples=samples,
                 seed=self._shot.sampling.seed + number,
                 frame=self._frame,
-                orders=PILOT_ORDERS + 1,
+                orders=orders,
                 threads=self._threads,
                 control=self._control,
             )
@@ -147,16 +189,25 @@ class Pilot:
         return half(1), half(2)
 
 
+def _sensible(samples: float) -> int:
+    return int(min(max(1.0, samples), PILOT_SAMPLES))
+
+
 def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
     """The mean opacity of a frame, and no less than tells a bucket from another."""
     return max(0.001, sum(half.opacity for half in halves) / 2)
 
 
+def _wholes(half: core.Partial) -> Planes:
+    """The pixels of all looks, of shape (looks, 3, pixels)."""
+    return np.stack([half.pixels(look)[..., :3].reshape(-1, 3).T for look in half.looks])
+
+
 def _planes(half: core.Partial) -> Planes:
     """The orders and the whole, of shape (looks, orders + 1, 3, rows, columns)."""
-    wholes = [np.moveaxis(half.pixels(look)[..., :3], -1, 0) for look in half.looks]
-    orders = [half.orders(look) for look in half.looks]
-    return np.concatenate([orders, np.expand_dims(wholes, 1)], axis=1)
+    orders = np.stack([half.orders(look) for look in half.looks])
+    wholes = _wholes(half).reshape(len(orders), 1, *orders.shape[2:])
+    return np.concatenate([orders, wholes], axis=1)
 
 
 def _tail(layers: Planes) -> NDArray[np.float64]:
@@ -188,8 +239,14 @@ def _blocks(planes: Planes) -> NDArray[np.float64]:
     return values
 
 
-def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Resolved:
-    """The smallest model whose shortfalls leave more than half of the tolerance's square."""
+def decide(
+    shot: Shot,
+    measure: Measure,
+    bias_from: Callable[[int], Seen],
+    earlier: Resolved | None = None,
+) -> Resolved:
+    """The smallest model whose shortfalls leave more than half of the tolerance's square.
+    `bias_from` tells how far `similarity` from an event on errs, and takes its time."""
     tolerance = shot.sampling.tolerance
     assert tolerance is not None  # the shot's own check
     limits = np.full(PILOT_ORDERS, tolerance / 8)
@@ -203,18 +260,22 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         depth, cut = shot.transport.max_bounces, 0.0  # the shot's own wish is no error
     share = _sun_share(shot)
     biases = {start: max(SKY_BIAS, share * bias) for start, bias in SIMILARITY_BIAS.items()}
-    fits = [start for start, bias in biases.items() if bias <= MOST_BIAS * tolerance]
     bias, reduce_from = 0.0, shot.transport.reduce_from
     if depth == 1:
         method, why = "reference", "nothing to reduce"
     elif shot.volumes[0].anisotropy <= 0:
         method, why = "reference", "no lobe to reduce"
-    elif not fits:
-        method, why = "reference", "similarity errs by too much"
     else:
-        method, reduce_from = "similarity", fits[0]
-        bias = biases[reduce_from]
-        why = f"similarity from event {reduce_from} errs by at most {bias:.1%}"
+        method, why = "reference", "similarity errs by too much"
+        for start, usual in biases.items():
+            if usual > MOST_BIAS * tolerance:
+                continue
+            # Where the orders that it changes bring less than that, there is nothing to look for.
+            seen = bias_from(start) if measure.tail[start] > usual else Seen(0.0, 0.0)
+            if _serves(start, seen, usual, MOST_BIAS * tolerance, earlier):
+                method, reduce_from, bias = "similarity", start, max(usual, seen.bias - seen.error)
+                why = f"similarity from event {start} errs by about {bias:.1%}"
+                break
     reach = {None: "all orders", 1: "single scattering"}.get(depth, f"{depth} orders")
     without = "" if depth == 1 else f"; single scattering would leave out {measure.tail[1]:.1%}"
     return Resolved(
@@ -227,6 +288,18 @@ def decide(shot: Shot, measure: Measure, earlier: Resolved | None = None) -> Res
         reason=f"{reach}, which leaves out {cut:.1%}{without}; {why}, "
         f"for the tolerance {tolerance:.1%}{' once denoised' if shot.image.denoise else ''}",
     )
+
+
+def _serves(start: int, seen: Seen, usual: float, most: float, earlier: Resolved | None) -> bool:
+    """Whether `similarity` from an event on may serve: unless the pilot sees that it errs by more
+    than is usual, and by too much. What was passed over for the sequence's first frame must be seen
+    to err by less."""
+    margin = 1.0
+    if earlier is not None and earlier.max_bounces != 1:
+        if earlier.method != "similarity" or earlier.reduce_from > start:
+            return seen.bias + seen.error <= most / HYSTERESIS
+        margin = HYSTERESIS
+    return seen.bias - seen.error <= margin * usual or seen.bias <= margin * most
 
 
 def _sun_share(shot: Shot) -> float:
