@@ -39,10 +39,10 @@ test-slow: lint build/.built $(VENV)/.slow sanitize
 	ctest --test-dir build --output-on-failure --parallel $(JOBS)
 	$(PYTHON) -m pytest -m ''
 
-# About an hour; writes the page. Real caches are taken from ../shared/data, where there are any.
+# About half an hour; writes the page. Real caches are taken from ../shared/data, where there are any.
 chart: setup peers
 	$(PIP) --editable '.[bench]'
-	$(VENV)/bin/pileus chart --full --peers --out chart --page docs/speed-and-accuracy.md
+	$(VENV)/bin/pileus chart --full --peers --repeats 2 --out chart --page docs/speed-and-accuracy.md
 
 chart-small: setup peers
 	$(PIP) --editable '.[bench]'

@@ -22,7 +22,7 @@ lies above 0. Both are free of the truth's own noise, for the truth is kept as t
 halves. Time is that of the process's threads together (core seconds), which a busy machine
 disturbs least; renderers take turns, render by render. Start-up, reading and compiling are apart.
 
-Regenerate it with `make chart` (about an hour; `make chart-small` draws a small one in minutes
+Regenerate it with `make chart` (about half an hour; `make chart-small` draws a small one in minutes
 and leaves this page alone). `make peers` installs the peers.
 """
 

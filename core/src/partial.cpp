@@ -131,12 +131,12 @@ void Partial::pool_comparing(const Partial& other) {
     check_alike(other);
     const double n1 = samples.count(), n2 = other.samples.count(), n = n1 + n2;
     const std::size_t pixels = image.window().pixels();
-    apart.resize(image.looks().size() * 3 * pixels);
+    variance_between.resize(image.looks().size() * 3 * pixels);
     for (std::size_t look = 0; look < image.looks().size(); ++look) {
         for (std::size_t c = 0; c < 3; ++c) {
             const float* const mine = image.plane(look, r + c);
             const float* const theirs = other.image.plane(look, r + c);
-            float* const into = apart.data() + (look * 3 + c) * pixels;
+            float* const into = variance_between.data() + (look * 3 + c) * pixels;
             for (std::size_t pixel = 0; pixel < pixels; ++pixel) {
                 const double gap = double{theirs[pixel]} - mine[pixel];
                 into[pixel] = storable(gap * gap * n1 * n2 / (n * n));

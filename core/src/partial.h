@@ -39,7 +39,7 @@ struct Partial {
     bool unmet = false;
     std::string identity;  // of the frame it belongs to: partials of different ones never mix
     // Of `pool_comparing`, by look, R, G, B and pixel; not part of a file.
-    std::vector<float> apart;
+    std::vector<float> variance_between;
 
     /// Whole or not at all. The header carries a digest of everything. Throws std::runtime_error.
     void write(const std::string& path) const;

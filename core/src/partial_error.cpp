@@ -93,11 +93,13 @@ double Partial::relative_error() const {
             levels[c] = blocks.means(image.plane(look, r + c));
             ripples[c] = blocks.ripples(image.plane(look, r + c));
             if (samples.count() > 1) variances[c] = blocks.means(image.plane(look, variance_r + c));
-            if (!apart.empty()) ranges[c] = blocks.means(apart.data() + (look * 3 + c) * pixels);
+            if (!variance_between.empty())
+                ranges[c] = blocks.means(variance_between.data() + (look * 3 + c) * pixels);
         }
         double least = relative(levels, ripples).upper(margin);
         if (samples.count() > 1) least = std::min(least, relative(levels, variances).upper(margin));
-        if (!apart.empty()) least = std::min(least, relative(levels, ranges).upper(margin));
+        if (!variance_between.empty())
+            least = std::min(least, relative(levels, ranges).upper(margin));
         greatest = std::max(greatest, least);
     }
     return std::sqrt(greatest);
