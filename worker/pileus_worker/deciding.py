@@ -32,6 +32,9 @@ BLOCK = 4
 SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
+# So many standard errors must a bias that the pilot sees be over the usual one. With one, every
+# third noisy pilot would see one where there is none; with two, the noisiest would see no fog.
+CLEAR = 1.5
 Planes = NDArray[np.float32]
 # A decision stands along a sequence until the measure has left its limit by as much.
 HYSTERESIS = 1.25
@@ -54,6 +57,14 @@ class Seen:
 
     bias: float
     error: float
+
+    @property
+    def least(self) -> float:
+        return self.bias - CLEAR * self.error
+
+    @property
+    def most(self) -> float:
+        return self.bias + CLEAR * self.error
 
 
 def resolve(
@@ -273,7 +284,7 @@ def decide(
             # Where the orders that it changes bring less than that, there is nothing to look for.
             seen = bias_from(start) if measure.tail[start] > usual else Seen(0.0, 0.0)
             if _serves(start, seen, usual, MOST_BIAS * tolerance, earlier):
-                method, reduce_from, bias = "similarity", start, max(usual, seen.bias - seen.error)
+                method, reduce_from, bias = "similarity", start, max(usual, seen.least)
                 why = f"similarity from event {start} errs by about {bias:.1%}"
                 break
     reach = {None: "all orders", 1: "single scattering"}.get(depth, f"{depth} orders")
@@ -297,9 +308,9 @@ def _serves(start: int, seen: Seen, usual: float, most: float, earlier: Resolved
     margin = 1.0
     if earlier is not None and earlier.max_bounces != 1:
         if earlier.method != "similarity" or earlier.reduce_from > start:
-            return seen.bias + seen.error <= most / HYSTERESIS
+            return seen.most <= most / HYSTERESIS
         margin = HYSTERESIS
-    return seen.bias - seen.error <= margin * usual or seen.bias <= margin * most
+    return seen.least <= margin * usual or seen.bias <= margin * most
 
 
 def _sun_share(shot: Shot) -> float:
