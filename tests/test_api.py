@@ -2,12 +2,15 @@
 
 import json
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, cast
 
+import httpx
 import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
@@ -15,12 +18,15 @@ from redis import Redis
 
 from pileus_service.app import create_app
 from pileus_service.auth import Guard
-from pileus_service.errors import InputError
+from pileus_service.client import Client
+from pileus_service.errors import FarmError, InputError
 from pileus_service.farm import Farm
 from pileus_service.jobs import Job, Merged, Planned, Wish, WorkerInfo
-from pileus_service.queue import Queue
+from pileus_service.queue import Queue, connect
 from pileus_service.server import make_server
+from pileus_service.shot import Shot
 from pileus_service.store import Store
+from pileus_worker.private_redis import PrivateRedis
 
 LOCAL = "http://127.0.0.1"
 WORKER = WorkerInfo(name="W", host="host", pid=1, threads=1, started=0.0)
@@ -94,6 +100,67 @@ def test_a_job_that_is_removed_as_it_comes_is_a_conflict(
 
     monkeypatch.setattr(farm.store, "create", create_and_remove)
     assert "submit it anew" in problem(client.post("/v1/jobs", json={"shot": shot}), 409)
+
+
+def test_what_is_on_disk_is_taken_though_redis_goes(
+    farm: Farm, shot: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    create = farm.store.create
+    with PrivateRedis(tmp_path / "redis") as own, connect(own.farm_url) as redis:
+        farm = Farm(farm.store, Queue(redis), farm.roots)
+
+        def create_and_end(job: Job, wish: Wish) -> bool:
+            new = create(job, wish)
+            own.end()
+            return new
+
+        monkeypatch.setattr(farm.store, "create", create_and_end)
+        with TestClient(create_app(farm, Guard()), base_url=LOCAL) as client:
+            answer = client.post("/v1/jobs", json={"shot": shot, "priority": 7})
+            assert answer.status_code == 201, answer.text
+            own.keep_up()
+            told = answer.json()["job"]
+            wait_for(lambda: bool(redis.ping()) and farm.queue.job_ids(10) == [told["id"]])
+            now = client.get(f"/v1/jobs/{told['id']}").json()
+    assert {**told, "created": 0, "active": []} == {**now, "created": 0, "active": []}
+
+
+def test_a_lost_answer_makes_no_second_job(
+    farm: Farm, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers: list[httpx.Response] = []
+    silent = threading.Event()
+
+    class Lossy(BaseHTTPRequestHandler):
+        """Gives a submission's first answer to nobody, and to any question none at all."""
+
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            kept = {name: self.headers[name] for name in ("Content-Type", "Idempotency-Key")}
+            answers.append(api.post(self.path, content=body, headers=kept))
+            if len(answers) > 1:
+                self.send_response(answers[-1].status_code)
+                self.end_headers()
+                self.wfile.write(answers[-1].content)
+
+        def do_GET(self) -> None:
+            silent.wait()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr("pileus_service.client.ANSWER", 0.5)
+    api = TestClient(create_app(farm, Guard()), base_url=LOCAL)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Lossy) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with Client(f"http://127.0.0.1:{server.server_port}") as client:
+            job = client.submit(Shot.model_validate(shot)).job.id
+            with pytest.raises(FarmError, match=r"did not answer in 0.5 s and may have done"):
+                client.jobs()
+        silent.set()
+        server.shutdown()
+    assert [answer.status_code for answer in answers] == [201, 200]
+    assert farm.queue.job_ids(10) == [job]
 
 
 def test_wrong_input_is_a_problem_that_points_at_the_field(

@@ -1,14 +1,15 @@
 """The API's client: what the commands and scripts use."""
 
+import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Self, TypeVar
 from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, TypeAdapter
-from tenacity import retry, retry_if_exception_type, stop_after_delay, wait_random_exponential
+from tenacity import Retrying, retry_if_exception_type, stop_after_delay, wait_random_exponential
 
 from pileus_service.errors import FarmError, InputError
 from pileus_service.framelog import LogLine
@@ -17,7 +18,15 @@ from pileus_service.messages import Accepted, Submission
 from pileus_service.shot import Shot
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
+
 PAGE = 1000
+ANSWER = 30.0  # seconds that the service may take
+RESTART = 10.0  # within which a service is back that was started anew
+
+
+class LostAnswerError(FarmError):
+    """The service had the request and its answer did not come: it may have done what was asked."""
 
 
 class Client:
@@ -28,7 +37,7 @@ class Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._http = httpx.Client(
-                base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=30
+                base_url=f"{server.rstrip('/')}/v1", headers=headers, timeout=ANSWER
             )
         except httpx.InvalidURL as error:
             raise InputError(f"--server {server}: {error}; write http://HOST:PORT") from None
@@ -53,11 +62,19 @@ class Client:
         *,
         wait_for_caches: bool = False,
     ) -> Accepted:
+        """Sends a shot; once more where the answer is lost, which under one key is one job."""
         body = Submission(
             shot=shot, priority=priority, webhook=webhook, wait_for_caches=wait_for_caches
-        )
-        headers = {"Idempotency-Key": key} if key else {}
-        answer = self._ask("POST", "/jobs", json=body.model_dump(mode="json"), headers=headers)
+        ).model_dump(mode="json")
+        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+
+        def send() -> httpx.Response:
+            return self._ask("POST", "/jobs", json=body, headers=headers)
+
+        try:
+            answer = send()
+        except LostAnswerError:
+            answer = _insist(send, RESTART)
         return Accepted.model_validate_json(answer.content)
 
     def jobs(self) -> Iterator[JobView]:
@@ -102,18 +119,8 @@ class Client:
 
     def watch(self, job: str) -> Iterator[JobView]:
         """The job twice a second until it ends; rides out a restart of the service."""
-
-        @retry(
-            retry=retry_if_exception_type(FarmError),
-            wait=wait_random_exponential(multiplier=0.2, max=5),
-            stop=stop_after_delay(120),
-            reraise=True,
-        )
-        def look() -> JobView:
-            return self.job(job)
-
         while True:
-            view = look()
+            view = _insist(lambda: self.job(job), 120)
             yield view
             if view.state in TERMINAL:
                 return
@@ -134,6 +141,12 @@ class Client:
             answer = self._http.request(verb, path, **more)
         except (httpx.InvalidURL, httpx.UnsupportedProtocol) as error:
             raise InputError(f"--server {self._server}: {error}") from None
+        except (httpx.ReadTimeout, httpx.ReadError, httpx.RemoteProtocolError) as error:
+            late = isinstance(error, httpx.ReadTimeout)
+            why = f"did not answer in {ANSWER:g} s" if late else f"broke off ({error})"
+            raise LostAnswerError(
+                f"{self._server}: the service {why} and may have done what was asked"
+            ) from None
         except httpx.TransportError as error:
             raise FarmError(
                 f"{self._server}: no service answers ({error}); start one with `pileus up`"
@@ -147,3 +160,14 @@ class Client:
         if answer.is_client_error:
             raise InputError(str(detail))
         raise FarmError(f"{self._server}: {detail}")
+
+
+def _insist(ask: Callable[[], T], seconds: float) -> T:
+    """Asks again for so long where the service fails or is not there."""
+    patient = Retrying(
+        retry=retry_if_exception_type(FarmError),
+        wait=wait_random_exponential(multiplier=0.2, max=5),
+        stop=stop_after_delay(seconds),
+        reraise=True,
+    )
+    return patient(ask)

@@ -4,6 +4,7 @@ import time
 from typing import Literal
 
 import structlog
+from redis.exceptions import RedisError
 
 from pileus_service.agreement import Agreement
 from pileus_service.errors import InputError
@@ -81,7 +82,15 @@ class Farm:
                 raise ConflictError("Idempotency-Key: was used for another shot; take a new key")
         if new:
             log.info("submitted", job=job.id, name=shot.name, frames=len(numbers))
-        view = self.job(job.id)
+        try:
+            view = self.job(job.id)
+        except RedisError as error:
+            if not new:
+                raise
+            # What is on disk is taken: `Agreement` brings it to Redis, and asked to try again the
+            # client would make another of it.
+            log.warning("submitted without Redis", job=job.id, reason=str(error))
+            view = _queued(job, priority)
         if view is None:
             raise ConflictError("The job was removed as it came; submit it anew")
         return view, new
@@ -245,3 +254,20 @@ class Farm:
             index, _, why = reason.partition(": ")
             reason = f"frame {numbers[int(index)]}: {why}"
         return view.model_copy(update={"active": active, "reason": reason})
+
+
+def _queued(job: Job, priority: Priority) -> JobView:
+    """A new job that Redis does not know yet."""
+    return JobView(
+        id=job.id,
+        name=job.shot.name,
+        state=JobState.QUEUED,
+        priority=priority,
+        frames=len(job.shot.frame_numbers),
+        frames_done=0,
+        frames_failed=0,
+        progress=0.0,
+        samples=0,
+        tasks=0,
+        created=job.created,
+    )
