@@ -29,6 +29,14 @@ def take(queue: Queue, info: WorkerInfo = A) -> Task:
     return task
 
 
+def take_all(queue: Queue) -> list[Task]:
+    """Every task that there is, each by a worker of its own."""
+    tasks: list[Task] = []
+    while task := queue.claim(worker(f"W{len(tasks)}")):
+        tasks.append(task)
+    return tasks
+
+
 def do(queue: Queue, task: Task, info: WorkerInfo = A, tasks: int = 3) -> bool:
     """Completes a task as a worker would, each plan with so many tasks."""
     results: dict[Kind, Planned | Rendered | Merged] = {

@@ -46,6 +46,19 @@ def test_an_absence_of_redis_costs_nobody_an_attempt(redis: Redis) -> None:
     assert again.attempt == 2, "B was there, and A was not"
 
 
+def test_a_claim_whose_answer_was_not_heard_costs_no_attempt(queue: Queue) -> None:
+    submit(queue, "low", priority=2)
+    unheard = take(queue, A)
+    submit(queue, "high", priority=8)
+    heard = take(queue, A)
+    assert heard.job == "high"
+    again = take(queue, B)
+    assert (again.entry, again.attempt) == (unheard.entry, 1)
+    assert do(queue, heard, A)
+    assert do(queue, again, B)
+    assert "attempts_failed" not in queue.stats()
+
+
 def test_renewal_keeps_the_lease_and_the_attempt_count(queue: Queue) -> None:
     submit(queue)
     task = take(queue, A)

@@ -6,7 +6,7 @@ from redis import Redis
 
 from pileus_service.jobs import Kind, Waiting
 from pileus_service.queue import Queue
-from queueing import A, do, planned, submit, take, view
+from queueing import A, do, planned, submit, take, take_all, view
 
 
 def test_higher_priority_goes_first_and_a_change_moves_waiting_tasks_once(queue: Queue) -> None:
@@ -16,7 +16,7 @@ def test_higher_priority_goes_first_and_a_change_moves_waiting_tasks_once(queue:
     submit(queue, "middle", frames=1, priority=5)
     for priority in (9, 2, 9):
         queue.control("low", "priority", priority)
-    order = [(task.job, task.frame) for task in iter(lambda: queue.claim(A), None)]
+    order = [(task.job, task.frame) for task in take_all(queue)]
     assert order == [("low", 0), ("low", 1), ("middle", 0)]
 
 
@@ -32,7 +32,7 @@ def test_equal_jobs_take_turns_and_none_waits_for_another_to_end(queue: Queue) -
     assert max(shares) - min(shares) <= 7, "more than a frame's tasks apart"
     submit(queue, "late", frames=1)
     # The window of those that wait already, and one turn of each: then it has its first.
-    assert "late" in [take(queue).job for _ in range(8 + 5 + 1)]
+    assert "late" in [task.job for task in take_all(queue)[: 8 + 5 + 1]]
 
 
 def test_parts_found_on_disk_are_not_issued(queue: Queue) -> None:

@@ -51,6 +51,16 @@ local function verdict(stream, id, task, deliveries, worker)
   return deliveries >= ATTEMPTS and 'park' or 'take'
 end
 
+-- Takes a task from a worker untried, for any to take at once: no attempt is counted.
+local function hand_back(stream, id, task, deliveries, worker)
+  land(task.job, worker)
+  if wanted(task) then
+    redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'RETRYCOUNT', deliveries - 1, 'JUSTID')
+  else
+    retire(stream, id)
+  end
+end
+
 local function record_try(stream, id, worker, reason)
   redis.call('HSET', tries_of(stream, id), worker, reason)
   redis.call('EXPIRE', tries_of(stream, id), 86400)

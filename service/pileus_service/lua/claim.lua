@@ -13,6 +13,21 @@ local function each_stream(act)
   end
 end
 
+-- A worker that claims has nothing in hand: what is its own is of a claim whose answer it did not hear.
+local function hand_back_unheard()
+  each_stream(function(stream)
+    for _, pending in ipairs(redis.call('XPENDING', stream, GROUP, '-', '+', 32, worker)) do
+      local id, deliveries = pending[1], pending[4]
+      local task = read(stream, id)
+      if task then
+        hand_back(stream, id, task, deliveries, worker)
+      else
+        redis.call('XACK', stream, GROUP, id)
+      end
+    end
+  end)
+end
+
 local function each_pending(stream, idle, act)
   local from = '-'
   while true do
@@ -162,6 +177,7 @@ local function take_new(priority, stream)
   end
 end
 
+hand_back_unheard()
 look_around()
 greet(worker, info)
 -- Where its data folder is another, or is not mounted, it would fail whatever it took.

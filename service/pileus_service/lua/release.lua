@@ -5,12 +5,10 @@ local worker, stream, id, reason = ARGV[2], stream_of(ARGV[3]), ARGV[4], ARGV[5]
 local pending, task = owned(stream, id, worker)
 if not pending then return 'lost' end
 local attempts = pending[4]
-land(task.job, worker)
-if not wanted(task) then
-  retire(stream, id)
-elseif reason == '' then
-  redis.call('XCLAIM', stream, GROUP, RELEASED, 0, id, 'RETRYCOUNT', attempts - 1, 'JUSTID')
+if reason == '' or not wanted(task) then
+  hand_back(stream, id, task, attempts, worker)
 else
+  land(task.job, worker)
   record_try(stream, id, worker, reason)
   if verdict(stream, id, task, attempts, worker) == 'park' then
     park(stream, id, task)
