@@ -83,6 +83,48 @@ def test_a_frame_stays_with_the_version_that_planned_it(redis: Redis) -> None:
     assert seen and seen.state == "done"
 
 
+def test_what_waits_for_one_version_is_bounded_and_keeps_no_other_from_work(redis: Redis) -> None:
+    queue = Queue(redis, LEASE)
+    queue.submit("job", "job", time.time(), 3, Wish())
+    task = queue.claim(NEW)
+    assert task and queue.complete(task, NEW.name, plan("2").model_copy(update={"tasks": 5000}))
+    others = [worker(f"old {number}", "1") for number in range(6)]
+    held = [(info, queue.claim(info)) for info in others]
+    for _ in range(50):
+        assert queue.claim(others[-1]) is None
+    assert redis.xlen("pileus:tasks:5") < 50
+    # The two frames that are left are theirs to plan, and what they have planned is theirs.
+    [(first, one), (second, two)] = [(info, task) for info, task in held if task]
+    assert {one.frame, two.frame} == {1, 2}
+    assert queue.complete(one, first.name, plan("1"))
+    assert queue.complete(two, second.name, plan("1"))
+    mine = queue.claim(first)
+    assert mine and mine.kind is Kind.RENDER and mine.frame in (1, 2)
+    task = queue.claim(NEW)
+    assert task and (task.frame, task.part) == (0, 0)
+
+
+def test_of_many_tasks_for_others_a_worker_looks_at_some_and_comes_to_all(redis: Redis) -> None:
+    queue = planned_by_old(redis, plan("1").model_copy(update={"tasks": 5000}))
+    crowd = [worker(f"new {number}", "2") for number in range(150)]
+    for info in crowd:
+        assert queue.claim(info, able=False) is None
+    for info in crowd[:3]:
+        assert queue.claim(info) is None
+    queue.submit("other", "other", time.time(), 1, Wish())
+    task = queue.claim(crowd[0])
+    assert task and task.job == "other"
+    queue.hand_back(task, crowd[0].name)  # it lies behind all of the others
+    assert redis.xpending("pileus:tasks:5", "workers")["pending"] > 300
+    for _ in range(4):
+        redis.config_resetstat()
+        found = queue.claim(NEW)
+        assert redis.info("commandstats")["cmdstat_xrange"]["calls"] < 150
+        if found:
+            break
+    assert found and found.entry == task.entry
+
+
 def test_a_failed_attempt_is_not_left_waiting_for_workers_of_another_version(redis: Redis) -> None:
     queue = planned_by_old(redis, Planned(tasks=1, finished=[], total=1, samples=0, version="1"))
     for attempt in (1, 2, 3):

@@ -20,15 +20,23 @@ local function live_workers()
   return redis.call('ZRANGEBYSCORE', 'pileus:alive', now() - LEASE, '+inf')
 end
 
--- Whether a task may go to a worker: a frame's parts and merge are for the version that planned it,
--- as long as a worker of that version lives.
-local function suits(task, worker)
-  local planned = redis.call('HGET', frame_of(task.job, task.frame), 'version')
-  if not planned or planned == redis.call('HGET', 'pileus:versions', worker) then return true end
-  for _, other in ipairs(live_workers()) do
-    if planned == redis.call('HGET', 'pileus:versions', other) then return false end
+-- The versions of the workers that live, asked for once in a script.
+local live
+local function lives(version)
+  if not live then
+    live = {}
+    for _, worker in ipairs(live_workers()) do
+      live[redis.call('HGET', 'pileus:versions', worker) or ''] = true
+    end
   end
-  return true
+  return live[version]
+end
+
+-- Whether a frame's tasks may go to a worker: its parts and merge are for the version that planned it,
+-- as long as a worker of that version lives.
+local function suits(job, frame, worker)
+  local planned = redis.call('HGET', frame_of(job, frame), 'version')
+  return not planned or planned == redis.call('HGET', 'pileus:versions', worker) or not lives(planned)
 end
 
 -- Whether a worker knows what a task says; until formats were told there was but the first.
@@ -44,7 +52,7 @@ local function verdict(stream, id, task, deliveries, worker)
   if redis.call('HEXISTS', tries, worker) == 0 then return 'take' end
   for _, other in ipairs(live_workers()) do
     if redis.call('HEXISTS', tries, other) == 0 and not aside(other) and reads(other, task)
-        and suits(task, other) then
+        and suits(task.job, task.frame, other) then
       return 'skip'
     end
   end

@@ -3,6 +3,7 @@
 -- A worker that is not able to do one (ARGV[4] is not 1) gets none; ARGV[5] is its trouble, if it has any,
 -- and ARGV[6] the farm of its data folder.
 local SWEEP = 250 -- milliseconds between looks for leases that ran out
+local LOOKS = 128 -- released tasks that one claim looks at, in each stream
 local TROUBLED = 3000 -- milliseconds for which a worker with trouble is set aside, and each time again
 local worker, info, able, trouble, farm = ARGV[2], ARGV[3], ARGV[4], ARGV[5], ARGV[6]
 
@@ -120,33 +121,44 @@ local function hold(stream, id, task)
   retire(stream, id)
 end
 
+local function suits_us(job, frame) return suits(job, frame, worker) end
+
+-- The released tasks that a claim looks at: of many some, and the next time those from there on, so that
+-- a worker comes to all of them.
+local function some_released(priority, stream)
+  local page = redis.call('XPENDING', stream, GROUP, '-', '+', LOOKS, RELEASED)
+  if #page < LOOKS then return page end
+  local place = 'pileus:looked:' .. priority .. ':' .. worker
+  page = redis.call('XPENDING', stream, GROUP, redis.call('GET', place) or '-', '+', LOOKS, RELEASED)
+  if #page < LOOKS then
+    redis.call('DEL', place)
+  else
+    redis.call('SET', place, '(' .. page[LOOKS][1], 'PX', LEASE)
+  end
+  return page
+end
+
 local function take_released(priority, stream)
-  local from = '-'
-  while true do
-    local page = redis.call('XPENDING', stream, GROUP, from, '+', 32, RELEASED)
-    for _, pending in ipairs(page) do
-      local id, attempts = pending[1], pending[4]
-      local task = read(stream, id)
-      if not task then
-        redis.call('XACK', stream, GROUP, id)
-      elseif not readable(task) then
-        -- A newer worker's: it stays where it is.
-      elseif not wanted(task) then
-        retire(stream, id)
-      elseif redis.call('HGET', job_of(task.job), 'state') == 'paused' then
-        hold(stream, id, task)
-      else
-        local fate = suits(task, worker) and verdict(stream, id, task, attempts, worker)
-        if fate == 'park' then
-          park(stream, id, task)
-        elseif fate == 'take' then
-          redis.call('XCLAIM', stream, GROUP, worker, 0, id)
-          return given(priority, id, attempts + 1, task)
-        end
+  for _, pending in ipairs(some_released(priority, stream)) do
+    local id, attempts = pending[1], pending[4]
+    local task = read(stream, id)
+    if not task then
+      redis.call('XACK', stream, GROUP, id)
+    elseif not readable(task) then
+      -- A newer worker's: it stays where it is.
+    elseif not wanted(task) then
+      retire(stream, id)
+    elseif redis.call('HGET', job_of(task.job), 'state') == 'paused' then
+      hold(stream, id, task)
+    else
+      local fate = suits_us(task.job, task.frame) and verdict(stream, id, task, attempts, worker)
+      if fate == 'park' then
+        park(stream, id, task)
+      elseif fate == 'take' then
+        redis.call('XCLAIM', stream, GROUP, worker, 0, id)
+        return given(priority, id, attempts + 1, task)
       end
-      from = '(' .. id
     end
-    if #page < 32 then return nil end
   end
 end
 
@@ -169,7 +181,7 @@ local function take_new(priority, stream)
       retire(stream, id)
     elseif state == 'paused' then
       hold(stream, id, task)
-    elseif not suits(task, worker) then
+    elseif not suits_us(task.job, task.frame) then
       leave_to_others(stream, id)
     else
       return given(priority, id, 1, task)
@@ -192,6 +204,7 @@ for priority = 9, 0, -1 do
     if not task and redis.call('EXISTS', ring_of(priority)) == 1 then
       refill(priority)
       task = take_new(priority, stream)
+      if not task and issue_for(priority, suits_us) then task = take_new(priority, stream) end
     end
     if task then return task end
   end

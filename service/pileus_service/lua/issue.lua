@@ -3,6 +3,7 @@
 -- job in turn. So equals share, and what waits in Redis grows with the workers, never with the jobs.
 
 local FRAMES = 1024 -- frames of one job in flight, at most
+local JOBS = 16 -- that are asked in one go for a task of a kind
 
 local function alive() return redis.call('ZCOUNT', 'pileus:alive', now() - LEASE, '+inf') end
 
@@ -46,12 +47,19 @@ local function begun(key, frame)
     or redis.call('ZSCORE', key .. ':active', frame) and true or false
 end
 
+-- The first of a job's planned frames that has tasks to issue; of those that suit, where that is asked.
+local function next_ready(job, suiting)
+  for _, frame in ipairs(redis.call('ZRANGE', job_of(job) .. ':ready', 0, suiting and -1 or 0)) do
+    if not suiting or suiting(job, frame) then return frame end
+  end
+end
+
 -- Issues one task of a job: of a planned frame if there is one, else the plan of the next frame.
-local function issue_one(job)
+local function issue_one(job, suiting)
   local key = job_of(job)
   if redis.call('HGET', key, 'state') ~= 'running' then return false end
   while true do
-    local frame = redis.call('ZRANGE', key .. ':ready', 0, 0)[1]
+    local frame = next_ready(job, suiting)
     if not frame then break end
     local at = frame_of(job, frame)
     local tasks, part = unpack(redis.call('HMGET', at, 'tasks', 'issued'))
@@ -74,12 +82,14 @@ local function issue_one(job)
   return true
 end
 
--- Fills a priority's stream up to its window, a task a job in turn.
+-- Fills a priority's stream up to its window, a task a job in turn. What was released waits as well: the
+-- worker that it is for may be one of many.
 local function refill(priority)
   local stream, ring = stream_of(priority), ring_of(priority)
   local room = math.max(8, 2 * alive())
   if redis.call('EXISTS', stream) == 1 then
     room = room - (redis.call('XLEN', stream) - group_info(stream)['pending'])
+    if room > 0 then room = room - #redis.call('XPENDING', stream, GROUP, '-', '+', room, RELEASED) end
   end
   while room > 0 do
     local job = redis.call('LPOP', ring)
@@ -91,6 +101,16 @@ local function refill(priority)
       redis.call('HDEL', job_of(job), 'ringed')
     end
   end
+end
+
+-- Issues one task that suits a worker for which all that waits is for others.
+local function issue_for(priority, suiting)
+  local ring = ring_of(priority)
+  for _, job in ipairs(redis.call('LRANGE', ring, 0, JOBS - 1)) do
+    redis.call('RPUSH', ring, redis.call('LPOP', ring))
+    if issue_one(job, suiting) then return true end
+  end
+  return false
 end
 
 -- Says that a job may have something to issue.
