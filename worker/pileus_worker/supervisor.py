@@ -210,8 +210,6 @@ class Supervisor:
         self._child: Child | None = None
         self._false_starts = 0  # of children, in a row
         self._output = Output()
-        # What was dropped while Redis was away, to be handed back when it is there again.
-        self._owed: Task | None = None
         # As Redis was when last spoken to: while it is away, nothing is told it that can be spared.
         self._away = False
         # Jobs whose next cache is not read ahead: a child was lost that did so.
@@ -225,9 +223,6 @@ class Supervisor:
                 able, trouble = self._readiness()
                 asked_at = time.monotonic()
                 try:
-                    if self._owed is not None:
-                        self._queue.hand_back(self._owed, self.info.name)
-                        self._owed = None
                     task = self._queue.claim(self.info, self._farm(), able=able, trouble=trouble)
                     self._away = False
                 except RedisError as error:
@@ -398,10 +393,10 @@ class Supervisor:
                 if ending.asked.is_set():
                     return None
             if time.monotonic() - leased > self._queue.lease:
-                # Another has it by now, or will: nobody is to do one thing twice at a time.
+                # Another has it by now, or will: nobody is to do one thing twice at a time. If it is
+                # ours still when Redis is there again, the next claim hands it back.
                 log.warning("dropped: no word from Redis for as long as a lease")
                 self._stop_child(renderer)
-                self._owed = task
                 return None
             self._keep_within_limits(renderer, now - moved)
 
