@@ -6,11 +6,15 @@ from typing import Any
 
 import pileus_core as core
 import pytest
+from redis import Redis
 
 from hosts import PILEUS, process, service, until
 from pileus_service.errors import InputError
 from pileus_service.jobs import Plan
+from pileus_service.measures import Measures
+from pileus_service.queue import Queue
 from pileus_service.shot import Shot
+from pileus_service.store import Store
 from pileus_worker.paths import PathMap
 
 
@@ -66,6 +70,31 @@ def test_a_worker_renders_where_its_own_mounts_are(
     plan = Plan.model_validate_json((frames / "plan.json").read_bytes())
     assert plan.cache.path == str(farm / "caches" / "cloud.vdb")
     assert json.loads((frames / "done.json").read_text())["file"] == str(asked.output(1))
+
+
+def test_a_job_that_is_gone_from_the_disk_fails_nothing_and_holds_nobody_up(
+    tmp_path: Path, redis_url: str, redis: Redis, shot: dict[str, Any]
+) -> None:
+    """As where its service was killed between the disk and Redis."""
+    data = tmp_path / "data"
+    (tmp_path / "caches").mkdir()
+    for frame in (1, 2, 3):
+        cloud = tmp_path / "caches" / f"cloud.{frame:04d}.vdb"
+        core.make_cloud(str(cloud), frame=frame, frames=3, resolution=32)
+    short = Shot.model_validate(shot)
+    endless = Shot.model_validate({**shot, "sampling": {"samples": 1 << 18}})
+    with service(data, redis_url, tmp_path) as client:
+        gone, stays = (client.submit(asked).job.id for asked in (endless, short))
+    store, queue = Store(data), Queue(redis)
+    command: list[str | Path] = [PILEUS, "worker", "--data", data, "--redis", redis_url]
+    with process(tmp_path / "worker.log", *command, "--root", tmp_path, "--threads", "1"):
+        until(lambda: queue.stats().get("tasks_done"), 120)
+        store.forget(gone)
+        until(lambda: queue.state(stays) in ("done", "failed"), 120)
+    assert queue.state(stays) == "done", queue.failed(stays)
+    assert queue.state(gone) is None
+    assert "attempts_failed" not in queue.stats()
+    assert "failures" not in {name for name, *_ in Measures(redis).read()}
 
 
 def test_a_worker_whose_data_folder_is_not_mounted_waits_and_fails_nothing(

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def everything(folder: Path) -> set[Path]:
         ("os.fsync", 1, "write_whole(Path(data) / 'outbox' / 'msg_1.json', b'{}')"),
         ("os.fsync", 1, MADE),
         ("os.fsync", 3, MADE),
-        ("shutil.rmtree", 1, "store.remove('other')"),
+        ("shutil.rmtree", 1, "shutil.rmtree(store.forget('other'))"),
     ],
     ids=["state", "token", "notice", "job half made", "job nearly made", "job half removed"],
 )
@@ -75,13 +76,14 @@ def test_what_a_killed_writer_left_is_swept_when_a_service_starts(
         name: Job(id=name, created=time.time(), shot=Shot.model_validate(shot))
         for name in ("job", "other")
     }
+    store.begin()
     Tokens(store.root).create("ops", Role.ADMIN)
     (store.root / "outbox").mkdir()
     store.create(jobs["job"], Wish(state="paused"))
-    if "remove" in act:
+    if "forget" in act:
         before = everything(store.root)
     store.create(jobs["other"], Wish(state="paused"))
-    if "remove" not in act:
+    if "forget" not in act:
         before = everything(store.root)
     killed(store.root, jobs["job"], where, count, act)
     left = everything(store.root) - before
@@ -101,21 +103,25 @@ def test_what_a_killed_writer_left_is_swept_when_a_service_starts(
     assert store.job("job") == jobs["job"]
 
 
-def test_a_job_made_anew_while_its_forerunner_is_removed_stays(
+def test_while_a_jobs_files_are_removed_nobody_waits_and_one_made_anew_stays(
     farm: Farm, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = farm.store
     job = Job(id="job", created=time.time(), shot=Shot.model_validate(shot))
     store.create(job, Wish(state="paused"))
     again = Store(store.root)
+    assert farm.job("job")
 
     def meanwhile(path: Path, ignore_errors: bool = False) -> None:
+        assert farm.queue.state("job") is None
+        with ThreadPoolExecutor(1) as others:
+            assert others.submit(farm.agreement.lock.acquire, timeout=10).result()
         assert again.create(job, Wish())
         monkeypatch.undo()
         shutil.rmtree(path, ignore_errors=ignore_errors)
 
     monkeypatch.setattr("shutil.rmtree", meanwhile)
-    store.remove("job")
+    assert farm.remove("job")
     assert store.job("job") == job
     assert store.wished("job") == Wish()
 

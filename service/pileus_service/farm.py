@@ -1,5 +1,6 @@
 """The farm as the service sees it: the store, which is the truth, and the queue kept true to it."""
 
+import shutil
 import time
 from typing import Literal
 
@@ -133,11 +134,11 @@ class Farm:
                 return False
             self.agreement.forget(job_id)
             # The disk first, or a reconciliation would bring it back.
-            self.store.remove(job_id)
-            self.queue.control(job_id, "cancel")
+            gone = self.store.forget(job_id)
             self.queue.control(job_id, "remove")
             log.info("removed", job=job_id)
-            return True
+        shutil.rmtree(gone, ignore_errors=True)  # of ten thousand partials: nobody waits for that
+        return True
 
     def job(self, job_id: str) -> JobView | None:
         """A job; one that Redis has lost is put back first."""

@@ -86,11 +86,9 @@ class FrameStore:
             return set()
 
     def look_again(self) -> None:
-        """Has an NFS client ask which names there are: it may remember one as absent that another
-        host has made since, and asks anew when a folder is opened (close-to-open consistency)."""
         for folder in (self.folder, self.folder / "parts"):
             with contextlib.suppress(FileNotFoundError):
-                os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
+                _look_again(folder)
 
     def plan(self) -> Plan | None:
         return _read(self.folder / "plan.json", Plan)
@@ -125,6 +123,12 @@ class FrameStore:
         """Removes the partials, and what was being written here when its writer was killed."""
         self.drop_parts()
         sweep(self.folder)
+
+
+def _look_again(folder: Path) -> None:
+    """Has an NFS client ask which names there are: it may remember one as absent that another
+    host has made since, and asks anew when a folder is opened (close-to-open consistency)."""
+    os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
 
 
 def farm_of(root: Path) -> str | None:
@@ -168,6 +172,11 @@ class Store:
     def has(self, job_id: str) -> bool:
         return (self._folder(job_id) / "job.json").exists()
 
+    def removed(self, job_id: str) -> bool:
+        """Whether a job is not here, nor was just made by another host."""
+        _look_again(self.jobs_folder)
+        return not self.has(job_id)
+
     def job_ids(self, known: Container[str] = ()) -> Iterator[str]:
         """The jobs that are here; a folder of a known one is believed to hold it."""
         return (name for name in self.folders() if name in known or self.has(name))
@@ -193,14 +202,14 @@ class Store:
         marks = {path.parent.name for path in self._folder(job.id).glob("frames/*/done.json")}
         return [i for i, n in enumerate(job.shot.frame_numbers) if f"{n:06d}" in marks]
 
-    def remove(self, job_id: str) -> None:
-        """Forgets a job; its images, which lie outside, stay."""
+    def forget(self, job_id: str) -> Path:
+        """Forgets a job at once, as one of the same id may be made while its files go; they are in
+        the folder that is returned. Its images, which lie outside, stay."""
         folder = self._folder(job_id)
-        # At once, as one of the same id may be made while this one goes.
         gone = folder.with_name(f".{job_id}.{secrets.token_hex(4)}")
         with contextlib.suppress(FileNotFoundError):
             folder.rename(gone)
-        shutil.rmtree(gone, ignore_errors=True)
+        return gone
 
     def sweep(self, before: float) -> None:
         """Removes what killed writers left here, beside the jobs."""

@@ -249,6 +249,12 @@ class Supervisor:
         except OSError:
             return None
 
+    def _removed(self, job: str) -> bool:
+        """Whether the farm has a job no more; it may only be out of our sight where its folder is
+        not the farm's."""
+        farm = self._farm()
+        return farm is not None and self._store.removed(job) and self._queue.farm() == farm
+
     def _readiness(self) -> tuple[bool, str]:
         """Whether the child can do a task at once, and if none will start, why. No task is claimed
         for one that still starts, which would hold it up for seconds, and its end in that time
@@ -273,9 +279,17 @@ class Supervisor:
         """Does a task whose lease began at `leased`, and says how that went."""
         try:
             job = self._store.job(task.job)
+            if job is None and self._removed(task.job):
+                # Whoever removed it could not tell Redis, or has yet to.
+                log.info("dropped: its job was removed", job=task.job, task=task.label)
+                self._queue.control(task.job, "remove")
+                return
             if job is None:
                 raise FileNotFoundError(f"{self._store.root}: has no job {task.job}")
             frame = job.shot.frame_numbers[task.frame]
+        except RedisError as error:
+            log.warning("left for the next claim to hand back", reason=str(error))
+            return
         except (OSError, IndexError) as error:
             log.warning("cannot begin", job=task.job, task=task.label, reason=str(error))
             self._tell(task, child.Failed(str(error), Cause.DISK), ending)
@@ -298,6 +312,9 @@ class Supervisor:
         begun = time.monotonic()
         log.info("begun")
         outcome = self._do(job, frame, task, leased, ending)
+        with contextlib.suppress(OSError, RedisError):
+            if isinstance(outcome, child.Failed) and self._removed(job.id):
+                outcome = None  # its files went under it
         self._note(task, outcome, time.monotonic() - begun)
         return outcome
 
@@ -393,8 +410,8 @@ class Supervisor:
                 if ending.asked.is_set():
                     return None
             if time.monotonic() - leased > self._queue.lease:
-                # Another has it by now, or will: nobody is to do one thing twice at a time. If it is
-                # ours still when Redis is there again, the next claim hands it back.
+                # Another has it by now, or will: nobody is to do one thing twice at a time. If it
+                # is ours still when Redis is there again, the next claim hands it back.
                 log.warning("dropped: no word from Redis for as long as a lease")
                 self._stop_child(renderer)
                 return None
