@@ -80,7 +80,7 @@ def test_nothing_that_a_client_sends_can_become_code() -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        Beat(7),
+        Beat(7, 2),
         Ready(),
         Failed("out of memory", Cause.MEMORY, Spent(1.5, 3, {"read": 0.25})),
         *(

@@ -1,7 +1,7 @@
 /* Faults by LD_PRELOAD, for what no test can bring about from outside.
  *
  * - Who opens a file whose name ends in FAULT_FILE meets what FAULT says: "crash" (a segmentation
- *   fault), "hang" (an endless wait) or "eat" (all memory that there is).
+ *   fault), "hang" (an endless wait), "slow" (half a second's) or "eat" (all memory that there is).
  * - The wall clock is off by as many seconds as the file CLOCK_OFFSET says.
  */
 #define _GNU_SOURCE
@@ -31,6 +31,7 @@ static void befall(const char* path) {
     if (strcmp(fault, "crash") == 0) raise(SIGSEGV);
     if (strcmp(fault, "hang") == 0)
         for (;;) pause();
+    if (strcmp(fault, "slow") == 0) usleep(500000);
     if (strcmp(fault, "eat") == 0)
         for (;;) {
             char* more = malloc(1 << 24);

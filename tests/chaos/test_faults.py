@@ -369,6 +369,21 @@ def test_a_file_that_changes_while_it_renders_gives_no_frame_of_two(
         same_bits(shot, farm.data, job, 1, tmp_path)
 
 
+@pytest.mark.slow
+def test_a_merge_that_takes_long_and_gets_on_is_no_hang(
+    cached_shot: Shot, tmp_path: Path, faults: Path
+) -> None:
+    """As one of twenty thousand partials, or of some on a slow disk."""
+    shot = longer(cached_shot, 200)
+    env = {"LD_PRELOAD": str(faults), "FAULT": "slow", "FAULT_FILE": ".exr"}
+    options = ("--stall-seconds=5",)
+    with Farm(tmp_path / "farm", [tmp_path], 2, options=options, env=env) as farm:
+        job = farm.client.submit(shot).job.id
+        assert ended(farm, job).state == "done"
+        assert "attempts_failed" not in farm.queue.stats()
+        same_bits(shot, farm.data, job, 1, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [

@@ -70,9 +70,10 @@ class Cancel:
 
 @dataclass(frozen=True)
 class Beat:
-    """The child lives, and has done so many pixel samples of its task."""
+    """The child lives, has done so many pixel samples of its task and taken so many other steps."""
 
     samples: int
+    steps: int
     says: Literal["beat"] = "beat"
 
 
@@ -188,12 +189,12 @@ class Life:
         self._told_bytes = 0
 
     def live(self) -> None:
-        self._say(Beat(0))
+        self._say(Beat(0, 0))
         while True:
             work = self._work
             if not self._pipe.poll(TICK):
                 if work is not None:
-                    self._say(Beat(work.control.samples_done))
+                    self._say(Beat(work.control.samples_done, work.steps))
                 continue
             message = self._pipe.recv()
             if isinstance(message, Order):

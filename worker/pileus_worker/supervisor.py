@@ -370,7 +370,8 @@ class Supervisor:
         self, renderer: Child, task: Task, leased: float, ending: Ending
     ) -> child.Finished | child.Failed | None:
         """Sees a task through; None if it was given up because nobody wants it from us."""
-        samples, moved = -1, time.monotonic()  # its first word, once it has started, is a move
+        beat = child.Beat(-1, 0)  # its first word, once it has started, is a move
+        moved = time.monotonic()
         renewal, look = time.monotonic(), time.monotonic() + LOOK
         ready = False
         while True:
@@ -381,15 +382,16 @@ class Supervisor:
             now = time.monotonic()
             if isinstance(message, child.Ready):
                 ready, renewal, moved = True, now, now
-            elif message is not None and message.samples != samples:
-                samples, moved = message.samples, now
+            elif message is not None and message != beat:
+                beat, moved = message, now
             try:
                 if ending.overdue:
                     self._stop_child(renderer)
                     self._queue.hand_back(task, self.info.name)
                     return None
                 if now >= renewal:
-                    told = self.info.model_copy(update={"task": task, "samples": max(0, samples)})
+                    done = {"task": task, "samples": max(0, beat.samples)}
+                    told = self.info.model_copy(update=done)
                     if (standing := self._queue.renew(task, told)) != "held":
                         log.warning("dropped", lease=standing)
                         self._give_up(renderer, task)

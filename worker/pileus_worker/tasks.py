@@ -66,6 +66,7 @@ class Work:
     read_ahead: bool
     control: core.Control = field(default_factory=core.Control)
     phases: dict[str, float] = field(default_factory=dict)
+    steps: int = 0  # phases begun and partials read: what gets somewhere renders nothing, at times
 
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
@@ -221,6 +222,7 @@ class Work:
         redo, trouble = [], ""
         with self._phase("merge"):
             for index, part in enumerate(plan.parts):
+                self.steps += 1
                 try:
                     partial = self._read(files, part, plan)
                 except core.InputError as error:
@@ -344,6 +346,7 @@ class Work:
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         """Adds the seconds of a block to a phase of the task."""
+        self.steps += 1
         begun = time.perf_counter()
         try:
             yield
