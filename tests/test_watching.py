@@ -160,6 +160,17 @@ def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame:
     assert [int(line.event.split()[0]) for line in lines] == list(range(950, 1000))
 
 
+def test_a_data_folder_that_fails_ends_no_attempt_that_logs(tmp_path: Path) -> None:
+    store = Store(tmp_path / "data")
+    # What a disk says that is ill, root or not: an error, and not "not found".
+    (store.jobs_folder / "j").symlink_to("x" * 300)
+    with pytest.raises(OSError, match="too long"):
+        store.has("j")
+    record = logging.LogRecord("n", logging.INFO, "", 0, "begun", None, None)
+    with structlog.contextvars.bound_contextvars(job="j", frame=1, worker="w", task="merge"):
+        framelog.FrameLog(store).emit(record)
+
+
 def test_the_workers_log_is_bounded(tmp_path: Path) -> None:
     with (tmp_path / "workers.log").open("ab") as log:
         writer = Workers(["sh", "-c", "while echo line; do sleep 0.01; done"], 1, log)

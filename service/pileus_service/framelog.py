@@ -44,13 +44,15 @@ class FrameLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         about = structlog.contextvars.get_contextvars()
-        if not {"job", "frame", "worker"} <= about.keys() or not self._store.has(about["job"]):
+        if not {"job", "frame", "worker"} <= about.keys():
             return
         try:
+            if not self._store.has(about["job"]):
+                return
             folder = self._store.frame(about["job"], about["frame"]).logs
             _append(folder / f"{about['worker']}.jsonl", self.format(record))
         except OSError:
-            # The worker's own log has the line; a full disk must not end the attempt.
+            # The worker's own log has the line; a disk that fails must not end the worker.
             return
 
 
