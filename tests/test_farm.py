@@ -230,8 +230,8 @@ def test_a_lost_redis_loses_nothing_and_renders_nothing_twice(
     same_bits(long_shot, tmp_path / "farm", job, 1, tmp_path)
 
 
-@pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "foreign"])
-def test_a_damaged_partial_is_rendered_again(
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "foreign", "plan"])
+def test_what_is_damaged_on_disk_is_made_again(
     client: Client, long_shot: Shot, tmp_path: Path, damage: str
 ) -> None:
     job = client.submit(long_shot).job.id
@@ -241,12 +241,12 @@ def test_a_damaged_partial_is_rendered_again(
         assert time.monotonic() < end
         time.sleep(0.01)
     client.control(job, "pause")
-    victim = files[0]
+    victim = parts.with_name("plan.json") if damage == "plan" else files[0]
     data = bytearray(victim.read_bytes())
     if damage == "flipped":
         data[len(data) // 2] ^= 0x10
         victim.write_bytes(data)
-    elif damage == "truncated":
+    elif damage in ("truncated", "plan"):
         victim.write_bytes(data[: len(data) // 2])
     elif damage == "missing":
         victim.unlink()

@@ -95,7 +95,9 @@ class FrameStore:
 
     def keep_plan(self, plan: Plan) -> Plan:
         """Keeps the first plan that is made; returns the one that holds."""
-        write_whole(self.folder / "plan.json", plan.model_dump_json().encode(), once=True)
+        path, data = self.folder / "plan.json", plan.model_dump_json().encode()
+        if not write_whole(path, data, once=True) and self.plan() is None:
+            write_whole(path, data)  # a damaged one is made anew
         return self.plan() or plan
 
     def drop_plan(self) -> None:
