@@ -4,7 +4,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -350,6 +350,23 @@ def test_a_data_folder_that_is_not_mounted_any_more_costs_no_job(
     away.rename(root)
     submit(client, shot)
     wait_for(lambda: farm.agreement.states() == {"running": 2})
+
+
+def test_a_data_folder_that_goes_amid_a_look_costs_no_job(
+    farm: Farm, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view, _ = farm.submit(Shot.model_validate(shot), 5, None)
+    root, list_jobs = farm.store.root, farm.store.job_ids
+
+    def unmounted(known: Container[str]) -> Iterator[str]:
+        root.rename(root.with_name("away"))
+        farm.store.jobs_folder.mkdir(parents=True)
+        return list_jobs(known)
+
+    monkeypatch.setattr(farm.store, "job_ids", unmounted)
+    with pytest.raises(InputError, match="mount"):
+        farm.agreement.reconcile()
+    assert farm.queue.job_ids(10) == [view.id]
 
 
 def test_two_farms_on_one_redis_leave_each_others_jobs(

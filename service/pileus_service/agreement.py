@@ -5,7 +5,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import structlog
 
@@ -71,7 +71,7 @@ class Agreement:
         else:
             for job_id, standing in self._standings(changed):
                 if standing is not None and not self._store.has(job_id):
-                    self._queue.control(job_id, "remove")
+                    self._remove([job_id])
                 elif standing is not None:
                     self._agree(job_id, standing)
         self._seen = mark
@@ -110,8 +110,7 @@ class Agreement:
         # Redis first: what is on no disk by now was removed, and not just submitted.
         in_redis = set(self._all_in_redis())
         on_disk = set(_slowly(self._store.job_ids(known=self._wished)))
-        for job_id in in_redis - on_disk:
-            self._queue.control(job_id, "remove")
+        self._remove(in_redis - on_disk)
         for job_id in self._wished.keys() - on_disk:
             self.forget(job_id)
         astray = [
@@ -124,6 +123,13 @@ class Agreement:
             astray, key=lambda each: (self._wish(each[0]).state in TERMINAL, each[0])
         ):
             self._agree(job_id, standing)
+
+    def _remove(self, job_ids: Collection[str]) -> None:
+        """Has Redis forget jobs that were not found on the disk, if that is the farm's still."""
+        if job_ids:
+            self.check()
+        for job_id in job_ids:
+            self._queue.control(job_id, "remove")
 
     def _sweep(self) -> None:
         before = time.time() - SWEEP

@@ -252,8 +252,10 @@ class Supervisor:
     def _removed(self, job: str) -> bool:
         """Whether the farm has a job no more; it may only be out of our sight where its folder is
         not the farm's."""
-        farm = self._farm()
-        return farm is not None and self._store.removed(job) and self._queue.farm() == farm
+        if not self._store.removed(job):
+            return False
+        farm = self._farm()  # after the look, as the folder may have gone before it
+        return farm is not None and farm == self._queue.farm()
 
     def _readiness(self) -> tuple[bool, str]:
         """Whether the child can do a task at once, and if none will start, why. No task is claimed
