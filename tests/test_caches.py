@@ -1,14 +1,21 @@
-"""Volumes in memory: read once, ahead, bounded by bytes, and anew where their files changed."""
+"""Volumes in memory: read once, ahead, bounded by bytes, and anew where their files changed; and
+those that are still in the making."""
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pileus_core as core
 import pytest
 
-from pileus_service.jobs import Cache
+from pileus_service.farm import Farm
+from pileus_service.jobs import Cache, Kind, Planned, Result, Waiting
+from pileus_service.shot import Shot
 from pileus_worker.caches import Caches
+from pileus_worker.paths import NOWHERE_ELSE
+from pileus_worker.tasks import Work
 
 Clouds = list[Cache]
 
@@ -100,3 +107,52 @@ def test_a_file_that_changes_is_read_anew_and_a_failure_is_not_kept(
     after = caches.get(later, "density")
     assert after is not before
     assert after.active_voxels == before.active_voxels
+
+
+@pytest.fixture
+def plan(farm: Farm, shot: dict[str, Any], tmp_path: Path) -> Callable[[int], Result]:
+    """Plans a frame of a job that waits for its caches; the first one's is half written just now,
+    and the others are whole and old."""
+    for frame in (1, 2, 3):
+        path = tmp_path / "caches" / f"cloud.{frame:04d}.vdb"
+        core.make_cloud(str(path), frame=frame, frames=3, resolution=32)
+        os.utime(path, (0, 0))
+    first = tmp_path / "caches" / "cloud.0001.vdb"
+    first.rename(tmp_path / "whole")
+    first.write_bytes((tmp_path / "whole").read_bytes()[:2000])
+    shot["sampling"] = {"samples": 16, "tolerance": 0.2}
+    shot["transport"] = {"method": "auto"}
+    view, _ = farm.submit(Shot.model_validate(shot), 5, None, wait_for_caches=True)
+    job = farm.store.job(view.id)
+    assert job is not None
+
+    def run(frame: int) -> Result:
+        return Work(farm.store, farm.roots, Caches(1 << 30), 1, 1.0, job, frame,
+                    Kind.PLAN, 0, NOWHERE_ELSE, lambda: None, False).run()  # fmt: skip
+
+    return run
+
+
+def test_the_first_frames_cache_is_waited_for_where_auto_measures_it(
+    plan: Callable[[int], Result], tmp_path: Path
+) -> None:
+    first = tmp_path / "caches" / "cloud.0001.vdb"
+    for _ in range(2):  # at the second look it is as it was, and is read
+        told = plan(2)
+        assert isinstance(told, Waiting) and "cloud.0001.vdb" in told.wait
+    first.unlink()
+    told = plan(3)
+    assert isinstance(told, Waiting) and "cloud.0001.vdb" in told.wait
+    (tmp_path / "whole").rename(first)
+    assert isinstance(plan(1), Planned)
+    first.unlink()
+    assert isinstance(plan(2), Planned), "by the first one's plan"
+
+
+def test_no_clock_of_a_host_makes_a_cache_whole(
+    plan: Callable[[int], Result], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3600)
+    for _ in range(3):
+        assert isinstance(plan(1), Waiting)

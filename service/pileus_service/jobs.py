@@ -94,6 +94,12 @@ class Cache(Record):
     size: int
 
 
+class Look(Record):
+    """Caches as they were found where a frame waits for them."""
+
+    caches: list[Cache] = []
+
+
 class Part(Record):
     """A render task: samples [first, last) of a bucket of pixels."""
 

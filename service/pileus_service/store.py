@@ -17,7 +17,7 @@ from typing import TypeVar, cast
 
 from pydantic import ValidationError
 
-from pileus_service.jobs import JOB_ID, Cache, Done, FarmMark, Job, Part, Plan, Record, Wish
+from pileus_service.jobs import JOB_ID, Cache, Done, FarmMark, Job, Look, Part, Plan, Record, Wish
 
 FARM = "farm.json"
 R = TypeVar("R", bound=Record)
@@ -105,12 +105,16 @@ class FrameStore:
         (self.folder / "plan.json").unlink(missing_ok=True)
         self.drop_parts()
 
-    def seen(self) -> Cache | None:
-        """The cache as the last look found it, where a frame waits for it."""
-        return _read(self.folder / "seen.json", Cache)
+    def seen(self) -> list[Cache]:
+        """The caches as the last look found them, where a frame waits for them."""
+        look = _read(self.folder / "seen.json", Look)
+        return look.caches if look else []
 
-    def mark_seen(self, cache: Cache) -> None:
-        write_whole(self.folder / "seen.json", cache.model_dump_json().encode())
+    def mark_seen(self, caches: list[Cache]) -> float:
+        """Keeps what a look found; returns when that was, by the file server's clock."""
+        path = self.folder / "seen.json"
+        write_whole(path, Look(caches=caches).model_dump_json().encode())
+        return path.stat().st_mtime
 
     def done(self) -> Done | None:
         return _read(self.folder / "done.json", Done)

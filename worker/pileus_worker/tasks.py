@@ -110,7 +110,7 @@ class Work:
             try:
                 plan = files.keep_plan(self._new_plan(read, identity))
             except core.InputError as error:
-                if self.job.wait_for_caches and not _settled(read[0]):
+                if self.job.wait_for_caches and self._fresh(files, files.seen()):
                     return Waiting(wait=str(error))
                 raise
         there = files.parts()
@@ -123,15 +123,28 @@ class Work:
         )
 
     def _unready(self, files: FrameStore) -> str | None:
-        """Why the cache is not to be read yet: it is absent, or has changed since the last look."""
-        path = scene.cache_path(self.paths.shot(self.job.shot), self.frame)
-        if not path.exists():
-            return f"volumes.0.cache: {path} is not there yet"
-        cache = scene.cache_of(self.job.shot, self.frame, self.paths)
-        if _settled(cache) or files.seen() == cache:
-            return None
-        files.mark_seen(cache)
-        return f"volumes.0.cache: {path} may still be in the making"
+        """Why a cache is not to be read yet: it is absent, or has changed since the last look."""
+        shot, first, frames = self.job.shot, self._first, [self.frame]
+        if first is not None and self.store.frame(self.job.id, first).plan() is None:
+            frames.append(first)  # it is measured for this one
+        caches = []
+        for frame in frames:
+            path = scene.cache_path(self.paths.shot(shot), frame)
+            if not path.exists():
+                return f"volumes.0.cache: {path} is not there yet"
+            caches.append(scene.cache_of(shot, frame, self.paths))
+        seen = files.seen()
+        for cache in self._fresh(files, caches):
+            if cache not in seen:
+                here = self.paths.here(cache.path)
+                return f"volumes.0.cache: {here} may still be in the making"
+        return None
+
+    def _fresh(self, files: FrameStore, caches: list[Cache]) -> list[Cache]:
+        """Which of the caches were written to within the time after which they count as whole. A
+        look at them is kept with the frame: that tells the file server's time, not this host's."""
+        now = files.mark_seen(caches)
+        return [cache for cache in caches if now - cache.mtime_ns / 1e9 <= SETTLED_SECONDS]
 
     def _new_plan(self, read: list[Cache], identity: str) -> Plan:
         begun = time.time()
@@ -166,16 +179,20 @@ class Work:
             begun=begun,
         )
 
+    @property
+    def _first(self) -> int | None:
+        """The shot's first frame, in the light of which `auto` decides the others."""
+        first = self.job.shot.frame_numbers[0]
+        auto = self.job.shot.transport.method == "auto"
+        return first if auto and first != self.frame else None
+
     def _resolve(self, cache: Cache) -> Resolved:
-        """This frame's transport; for `auto` in the light of that of the shot's first frame, which
-        is measured now unless its plan tells it."""
-        shot = self.job.shot
-        first = shot.frame_numbers[0]
-        earlier = None
-        if shot.transport.method == "auto" and first != self.frame:
+        """This frame's transport; the first frame's is measured now unless its plan tells it."""
+        first, earlier = self._first, None
+        if first is not None:
             plan = self.store.frame(self.job.id, first).plan()
             earlier = (
-                self._decide(first, scene.cache_of(shot, first, self.paths), None)
+                self._decide(first, scene.cache_of(self.job.shot, first, self.paths), None)
                 if plan is None
                 else plan.transport
             )
@@ -360,7 +377,3 @@ class Work:
         if later and scene.cache_path(self.paths.shot(shot), later[0]).exists():
             cache = scene.cache_of(shot, later[0], self.paths)
             self.caches.read_ahead(cache, shot.volumes[0].density)
-
-
-def _settled(cache: Cache) -> bool:
-    return time.time() - cache.mtime_ns / 1e9 > SETTLED_SECONDS
