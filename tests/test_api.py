@@ -21,7 +21,7 @@ from pileus_service.auth import Guard
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, InputError
 from pileus_service.farm import Farm
-from pileus_service.jobs import Job, Merged, Planned, Wish, WorkerInfo
+from pileus_service.jobs import NEW_ID, Job, Merged, Planned, Wish, WorkerInfo
 from pileus_service.queue import Queue, connect
 from pileus_service.server import make_server
 from pileus_service.shot import Shot
@@ -156,9 +156,10 @@ def test_a_lost_answer_makes_no_second_job(
         with Client(f"http://127.0.0.1:{server.server_port}") as client:
             job = client.submit(Shot.model_validate(shot)).job.id
             with pytest.raises(FarmError, match=r"did not answer in 0.5 s and may have done"):
-                client.jobs()
+                next(client.jobs())
         silent.set()
         server.shutdown()
+    assert NEW_ID.fullmatch(job), "ids sort by time"
     assert [answer.status_code for answer in answers] == [201, 200]
     assert farm.queue.job_ids(10) == [job]
 

@@ -1,6 +1,5 @@
 """The API's client: what the commands and scripts use."""
 
-import secrets
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
@@ -13,7 +12,7 @@ from tenacity import Retrying, retry_if_exception_type, stop_after_delay, wait_r
 
 from pileus_service.errors import FarmError, InputError
 from pileus_service.framelog import LogLine
-from pileus_service.jobs import TERMINAL, FrameMap, FrameView, JobView, WorkerView
+from pileus_service.jobs import TERMINAL, FrameMap, FrameView, JobView, WorkerView, new_id
 from pileus_service.messages import Accepted, Submission
 from pileus_service.shot import Shot
 
@@ -66,7 +65,7 @@ class Client:
         body = Submission(
             shot=shot, priority=priority, webhook=webhook, wait_for_caches=wait_for_caches
         ).model_dump(mode="json")
-        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+        headers = {"Idempotency-Key": key or new_id()}
 
         def send() -> httpx.Response:
             return self._ask("POST", "/jobs", json=body, headers=headers)

@@ -14,6 +14,7 @@ from pileus_service.shot import Shot
 
 Priority = Annotated[int, Field(ge=0, le=9, strict=True)]
 JOB_ID = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+NEW_ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{8}")
 JobId = Annotated[str, StringConstraints(pattern=rf"^{JOB_ID.pattern}$")]
 Bucket = tuple[int, int, int, int]
 # Of a job's files, tasks and keys. A worker takes jobs up to its own format, so raise it when an
@@ -314,5 +315,8 @@ def new_id() -> str:
 
 
 def id_for_key(key: str) -> str:
-    """The id of a submission with an idempotency key: the same key is the same job."""
+    """The id of a submission with an idempotency key: the same key is the same job. A new id, as
+    the client makes one, is its own."""
+    if NEW_ID.fullmatch(key):
+        return key
     return "key-" + hashlib.sha256(key.encode()).hexdigest()[:24]
