@@ -1,5 +1,6 @@
 """What the farm tells of itself: attempts' logs and counters."""
 
+import contextlib
 import io
 import json
 import logging
@@ -259,15 +260,19 @@ def test_what_others_have_named_is_shown_as_it_is() -> None:
 
 
 def test_bars_and_notes_show_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = os.openpty()
-    with os.fdopen(ours, "rb") as screen, os.fdopen(theirs, "w") as terminal_of_a_person:
+    screen, keyboard = os.openpty()
+    with os.fdopen(keyboard, "w") as terminal_of_a_person:
         monkeypatch.setenv("TERM", "xterm")
         monkeypatch.setenv("COLUMNS", "200")
         monkeypatch.setattr(sys, "stderr", terminal_of_a_person)
         with Display() as display:
             display.show(Row(f"bar {NAME}", 0.5, ""))
             display.note(f"note {NAME}")
-        shown = screen.read1().decode()
+    shown = ""
+    with contextlib.suppress(OSError):  # its end is an error: nobody is at the terminal any more
+        while True:
+            shown += os.read(screen, 1 << 16).decode()
+    os.close(screen)
     assert f"bar {NAME}" in shown
     assert f"note {NAME}" in shown
 
