@@ -86,6 +86,15 @@ def test_images_of_any_shape_are_denoised(
         assert all(np.isfinite(channels[c]).all() and (channels[c] >= 0).all() for c in "RGB")
 
 
+@pytest.mark.parametrize("quality", get_args(Quality))
+@pytest.mark.parametrize("size", [(1, 1), (200, 3), (64, 48)])
+def test_nothing_from_beyond_the_image_is_drawn_in(size: tuple[int, int], quality: Quality) -> None:
+    color = np.broadcast_to(np.array([0.2, 0.3, 0.5], np.float32), (*size, 3)).copy()
+    guide = np.full((*size, 3), 0.5, np.float32)
+    found = Filter(2)({"color": color, "albedo": guide}, quality)
+    np.testing.assert_allclose(found, color, rtol=0.03)
+
+
 @pytest.mark.parametrize(
     ("sampling", "quality"),
     [

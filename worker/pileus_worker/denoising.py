@@ -18,6 +18,9 @@ Pixels = NDArray[np.float32]
 Quality = Literal["FAST", "HIGH"]  # as OIDN calls its networks; BALANCED is HIGH on a CPU
 FEW_SAMPLES = 4
 LOOSE_TOLERANCE = 0.04  # which few samples meet, once they are denoised
+# Beyond the image OIDN sees black and draws some of it in: corners came out half as bright. So it
+# is given the image's mirror there. Of 2 to 16 pixels 8 left the least error.
+MARGIN = 8
 
 
 def check_installed(shot: Shot, source: str) -> None:
@@ -67,10 +70,11 @@ class Filter:
         alone. All are of shape (height, width, 3 or more) and their first three channels count;
         returns (height, width, 3). Raises FarmError."""
         oidn = self._oidn
-        height, width = next(iter(images.values())).shape[:2]
-        output = np.empty((height, width, 3), np.float32)
+        edges = ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0))
+        wider = {name: np.pad(image, edges, "symmetric") for name, image in images.items()}
+        output = np.empty((*next(iter(wider.values())).shape[:2], 3), np.float32)
         with oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT) as rt:
-            for name, image in {**images, "output": output}.items():
+            for name, image in {**wider, "output": output}.items():
                 stride = image.shape[2] * image.itemsize
                 rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
             if "color" in images:
@@ -79,7 +83,7 @@ class Filter:
             rt.commit()
             rt.execute()
             self._check()
-        return output
+        return np.ascontiguousarray(output[MARGIN:-MARGIN, MARGIN:-MARGIN])
 
     def _check(self) -> None:
         error: Any = self._device.get_error()
