@@ -1,9 +1,12 @@
 """The commands that need no farm: what they write, what they refuse, how they end."""
 
 import json
+import os
 import resource
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +127,16 @@ def test_make_writes_a_sequence(tmp_path: Path) -> None:
     assert "greater --length" in refused(
         pileus("make", "cloud", tmp_path / "a.vdb", "--frames", "3", "--length", "2")
     )
+
+
+def test_making_ends_when_it_is_interrupted(tmp_path: Path) -> None:
+    command = [PILEUS, "make", "cloud", str(tmp_path / "c.####.vdb"), "--frames", "1-9"]
+    begun = subprocess.Popen([*command, "--resolution", "900"], start_new_session=True)
+    time.sleep(3)
+    os.killpg(begun.pid, signal.SIGINT)  # as a terminal does
+    # A frame takes longer, nine of them many minutes.
+    assert begun.wait(timeout=60) == 128 + signal.SIGINT
+    assert not list(tmp_path.glob("*.vdb"))
 
 
 def test_a_cache_that_does_not_fit_on_the_disk_is_not_there_at_all(tmp_path: Path) -> None:

@@ -87,10 +87,16 @@ def make(
             pool.submit(_frame, subject, expand(out, number), number, action, resolution, seed)
             for number in numbers
         ]
-        for done, job in enumerate(as_completed(jobs), 1):
-            voxels += job.result()
-            detail = f"{done} of {len(jobs)} frames"
-            display.show(Row(f"making {subject}", done / len(jobs), detail))
+        try:
+            for done, job in enumerate(as_completed(jobs), 1):
+                voxels += job.result()
+                detail = f"{done} of {len(jobs)} frames"
+                display.show(Row(f"making {subject}", done / len(jobs), detail))
+        except KeyboardInterrupt:
+            # The pool would first finish what it has begun, and Python hears nothing in the core.
+            for process in multiprocessing.active_children():
+                process.kill()
+            raise
     print(
         f"{out}: {len(numbers)} frames, {voxels / len(numbers) / 1e6:.2f} M active voxels a frame, "
         f"{duration(time.monotonic() - begun)}",
