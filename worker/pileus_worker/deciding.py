@@ -128,7 +128,7 @@ class Pilot:
         if image.denoise:
             self._share *= DENOISED_SHARE
         self._scene = scene.make_scene(small, frame, volume, reading)
-        self._bias_samples = 1
+        self._bias_samples = 0
 
     def opacity(self) -> float:
         return _opacity(self._halves((0, 1)))
@@ -140,8 +140,9 @@ class Pilot:
         halves = self._halves((0, 1))
         noise = [half.relative_error() for half in halves]
         wanted = min((max(noise) / sampling.tolerance) ** 2, sampling.samples)
-        samples = _sensible(self._share * wanted)
-        self._bias_samples = _sensible(BIAS_SHARE * self._share * wanted)
+        samples = int(min(max(1.0, self._share * wanted), PILOT_SAMPLES))
+        # Less than one would cost the frame more than its share, and tell nothing.
+        self._bias_samples = int(min(BIAS_SHARE * self._share * wanted, PILOT_SAMPLES))
         if samples > 1:
             for half, further in zip(halves, self._halves((1, samples)), strict=True):
                 half.pool(further)
@@ -155,6 +156,8 @@ class Pilot:
         """How far `similarity` from an event on errs: what all pixels of the volume have in common,
         as an RMS relative error of the frame, of the look where it is greatest. It has the random
         numbers of the truth, so that only what differs is noise."""
+        if self._bias_samples == 0:
+            return Seen(0.0, 0.0)
         truth = self._truth
         ours = self._pair("similarity", (0, self._bias_samples), start)
         differ = np.stack([_wholes(a) - _wholes(b) for a, b in zip(ours, truth, strict=True)])
@@ -198,10 +201,6 @@ class Pilot:
             )
 
         return half(1), half(2)
-
-
-def _sensible(samples: float) -> int:
-    return int(min(max(1.0, samples), PILOT_SAMPLES))
 
 
 def _opacity(halves: tuple[core.Partial, core.Partial]) -> float:
