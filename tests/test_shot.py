@@ -50,6 +50,7 @@ def test_frame_ranges(text: str, frames: list[int]) -> None:
         ("a.$F4.vdb", "a.0007.vdb"),
         ("a.$F.vdb", "a.7.vdb"),
         ("still.vdb", "still.vdb"),
+        ("/take #3/100%d/$F4/a.####.vdb", "/take #3/100%d/$F4/a.0007.vdb"),
     ],
 )
 def test_frame_patterns(pattern: str, name: str) -> None:

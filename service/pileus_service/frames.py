@@ -30,16 +30,18 @@ def parse_frames(text: str) -> tuple[int, ...]:
     return tuple(sorted(frames))
 
 
-def has_pattern(name: str) -> bool:
-    """Whether the file name stands for a sequence."""
-    return _PATTERN.search(name) is not None
+def has_pattern(path: str) -> bool:
+    """Whether the path stands for a sequence."""
+    return _PATTERN.search(path.rpartition("/")[2]) is not None
 
 
-def expand(name: str, frame: int) -> str:
-    """The file name of one frame; a name without a pattern is the same for all."""
+def expand(path: str, frame: int) -> str:
+    """The path of one frame; one without a pattern is the same for all. The folders are as they
+    are: whoever named one "take #3" meant no frame."""
 
     def number(match: re.Match[str]) -> str:
         width = len(match[0]) if match[0][0] == "#" else int(match[1] or match[2] or 0)
         return f"{frame:0{width}d}" if width else str(frame)
 
-    return _PATTERN.sub(number, name)
+    folder, slash, name = path.rpartition("/")
+    return folder + slash + _PATTERN.sub(number, name)

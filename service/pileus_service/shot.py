@@ -269,7 +269,7 @@ class Shot(Model):
         if len(self.frame_numbers) > 1 and not has_pattern(self.image.output):
             raise ValueError(
                 f"image.output = {self.image.output!r}: every frame would write this one file; "
-                "put #### where the frame's number goes"
+                "put #### into the file's name for the frame's number"
             )
         self._check_memory()
         if self.transport.method == "auto" and self.sampling.tolerance is None:

@@ -71,10 +71,11 @@ def test_a_frame_range_is_taken_or_refused_and_never_long(text: str) -> None:
         assert list(frames) == sorted(set(frames))
 
 
+name = st.text(alphabet="abc._-", max_size=8)
 literal = st.text(alphabet="abc./_-", max_size=8)
 
 
-@given(literal, literal, st.integers(0, 10**9), st.integers(1, 12))
+@given(literal, name, st.integers(0, 10**9), st.integers(1, 12))
 def test_the_three_kinds_of_pattern_put_the_number_alike(
     head: str, tail: str, frame: int, width: int
 ) -> None:
@@ -82,6 +83,8 @@ def test_the_three_kinds_of_pattern_put_the_number_alike(
     for pattern in ("#" * width, f"%0{width}d", f"$F{width}"):
         assert expand(head + pattern + tail, frame) == head + number + tail
         assert has_pattern(head + pattern + tail)
+        assert expand(f"{head}{pattern}/{tail}", frame) == f"{head}{pattern}/{tail}"
+        assert not has_pattern(f"{head}{pattern}/{tail}")
     for pattern in ("%d", "$F"):
         assert expand(head + pattern + tail, frame) == f"{head}{frame}{tail}"
     assert expand(head + tail, frame) == head + tail

@@ -65,7 +65,10 @@ def make(
     except ValueError as error:
         raise InputError(f"--frames {frames}: {error}") from None
     if len(numbers) > 1 and not has_pattern(out):
-        raise InputError(f"{out}: every frame would write this one file; put #### for the number")
+        raise InputError(
+            f"{out}: every frame would write this one file; put #### into the file's name for the "
+            "frame's number"
+        )
     action = length or max(USUAL_LENGTH, *numbers)
     outside = [number for number in numbers if not 1 <= number <= action]
     if outside:
