@@ -169,6 +169,9 @@ def test_wrong_input_is_a_problem_that_points_at_the_field(
 ) -> None:
     wrong = {**shot, "sampling": {"samples": 0}}
     assert "samples" in problem(client.post("/v1/jobs", json={"shot": wrong}), 422)
+    wrong = {**shot, "volumes": [{**shot["volumes"][0], "extinction": -1}]}
+    [error] = client.post("/v1/jobs", json={"shot": wrong}).json()["errors"]
+    assert error["pointer"] == "/body/shot/volumes/0/extinction"
     problem(
         client.post("/v1/jobs", content=b"{", headers={"content-type": "application/json"}), 422
     )

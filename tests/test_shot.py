@@ -130,6 +130,14 @@ def test_each_wrong_value_is_one_line_that_names_field_and_mend(
     assert said in line
 
 
+def test_a_line_counts_the_other_troubles_alone(shot_file: Path) -> None:
+    assert "more)" not in refusal(shot_file, "volumes.0.extinction=-1")
+    assert "more)" not in refusal(shot_file, "transport.looks=[{a=2.0}]")
+    two = ["volumes.0.extinction=-1", "transport.looks=[]"]
+    assert "volumes.0.extinction" in (line := refusal(shot_file, *two))
+    assert line.endswith("(and 1 more)")
+
+
 def test_orders_need_an_end(shot_file: Path) -> None:
     settings = ["image.orders=true", "transport={method='reference'}"]
     assert "image.orders: orders need an end" in refusal(shot_file, *settings)

@@ -1,8 +1,9 @@
 """The errors that a user can mend; each message is the one line that reaches them."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -41,7 +42,7 @@ def data_troubles(data: Path) -> Iterator[None]:
 
 def one_line(source: str, error: ValidationError) -> str:
     """The first trouble of a validation error as one line, with a count of the others."""
-    first, *others = error.errors(include_url=False)
+    first, *others = own_troubles(error.errors(include_url=False))
     # The tag of a union member ("distant") is part of pydantic's location, not of the file's.
     parts = [str(part) for part in first["loc"] if part not in _UNION_TAGS]
     where = ".".join(parts)
@@ -50,6 +51,20 @@ def one_line(source: str, error: ValidationError) -> str:
     shown = f" = {value!r:.80}" if isinstance(value, str | int | float) and where else ""
     more = f" (and {len(others)} more)" if others else ""
     return f"{source}: {where}{shown}: {message}{more}" if where else f"{source}: {message}{more}"
+
+
+def own_troubles(errors: Sequence[Any]) -> list[Any]:
+    """Pydantic's errors without those that only follow from another: it counts an item that is
+    wrong as none, and so finds its list too short."""
+    places = [error["loc"] for error in errors]
+
+    def follows(error: Any) -> bool:
+        size = len(error["loc"])
+        return error["type"] == "too_short" and any(
+            len(place) > size and place[:size] == error["loc"] for place in places
+        )
+
+    return [error for error in errors if not follows(error)]
 
 
 _UNION_TAGS = {"distant", "dome", "constant", "keyed"}

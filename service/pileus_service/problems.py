@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pileus_service.errors import ForeignError, InputError
+from pileus_service.errors import ForeignError, InputError, own_troubles
 from pileus_service.headers import HEADERS
 from pileus_service.queue import trouble
 
@@ -83,7 +83,7 @@ def install(app: FastAPI) -> None:
                 pointer="/" + "/".join(str(part) for part in each["loc"]),
                 detail=each["msg"].removeprefix("Value error, "),
             )
-            for each in error.errors()[:20]
+            for each in own_troubles(error.errors())[:20]
         ]
         first = errors[0]
         return _answer(422, f"{first.pointer[1:].replace('/', '.')}: {first.detail}", errors)
