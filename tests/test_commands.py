@@ -83,6 +83,9 @@ def test_wrong_input_of_render_is_one_line_and_exit_code_two(
     assert "density" in line
     assert "samples = 0" in refused(pileus("render", shot_file, "--set", "sampling.samples=0"))
     assert "gap of 1 of 3" in refused(pileus("render", shot_file, "--frames", "1-3"))
+    # A script whose variable is not set meant no frame, least of all each of them.
+    for command in ("render", "submit"):
+        assert "frames = '': '' is no" in refused(pileus(command, shot_file, "--frames", ""))
     (tmp_path / "file").touch()
     assert "image.output" in refused(pileus("render", shot_file, "--out", tmp_path / "file"))
     (tmp_path / "caches" / "cloud.0001.vdb").write_bytes(b"not a vdb")

@@ -44,7 +44,7 @@ def submit(
     as_json: AsJson = False,
 ) -> None:
     """Sends a shot to the farm."""
-    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
+    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames is not None else [])]
     with Client(server, token) as client:
         accepted = client.submit(
             load_shot(shot, settings), priority, key, webhook, wait_for_caches=wait_for_caches

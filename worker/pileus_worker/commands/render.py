@@ -36,7 +36,7 @@ def render(
     as_json: AsJson = False,
 ) -> None:
     """Renders a shot here and now: no farm needed."""
-    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames else [])]
+    settings = [*(sets or []), *([f"frames={json.dumps(frames)}"] if frames is not None else [])]
     shot = load_shot(shot_file, settings)
     if out is not None:
         output = str(out.resolve() / Path(shot.image.output).name)
