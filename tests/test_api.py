@@ -181,6 +181,10 @@ def test_wrong_input_is_a_problem_that_points_at_the_field(
     problem(client.get("/v1/jobs", params={"limit": 100_000}), 422)
     problem(client.get("/nowhere"), 404)
     problem(client.put("/v1/jobs"), 405)
+    keys = [{"frame": frame, "value": [0.0, 0.0, frame - 2.0]} for frame in (1, 3)]
+    wrong = {**shot, "camera": {"position": keys, "look_at": [0.0, 0.0, 0.0]}}
+    detail = problem(client.post("/v1/jobs", json={"shot": wrong}), 422)
+    assert "no view at frame 2" in detail
     (tmp_path / "caches" / "cloud.0002.vdb").unlink()
     assert "gap" in problem(client.post("/v1/jobs", json={"shot": shot}), 422)
 

@@ -83,6 +83,9 @@ def test_wrong_input_of_render_is_one_line_and_exit_code_two(
     assert "density" in line
     assert "samples = 0" in refused(pileus("render", shot_file, "--set", "sampling.samples=0"))
     assert "gap of 1 of 3" in refused(pileus("render", shot_file, "--frames", "1-3"))
+    keys = "[{frame = 1, value = [0, 0, 1]}, {frame = 3, value = [0, 0, -1]}]"
+    blind = ("--set", f"camera.position={keys}", "--set", "camera.look_at=[0, 0, 0]")
+    assert "no view at frame 2" in refused(pileus("render", shot_file, *blind))
     # A script whose variable is not set meant no frame, least of all each of them.
     for command in ("render", "submit"):
         assert "frames = '': '' is no" in refused(pileus(command, shot_file, "--frames", ""))

@@ -9,7 +9,7 @@ import pytest
 from pileus_service.errors import InputError
 from pileus_service.frames import expand, parse_frames
 from pileus_service.shot import Shot
-from pileus_service.shotfile import check_files, load_shot
+from pileus_service.shotfile import check_camera, check_files, load_shot
 
 
 @pytest.fixture
@@ -85,6 +85,18 @@ def test_camera_keys_are_linear_and_hold_at_the_ends(shot_file: Path) -> None:
     assert [shot.camera.at(frame).fov for frame in (1, 10, 15, 20, 99)] == [30, 30, 40, 50, 50]
 
 
+def test_a_camera_that_goes_blind_between_its_keys_is_refused_with_the_frame(
+    shot_file: Path,
+) -> None:
+    keys = "[{frame = 1, value = [0, 0, 2]}, {frame = 9, value = [0, 0, -2]}]"
+    shot = load_shot(
+        shot_file, [f"camera.position={keys}", "camera.look_at=[0, 0, 0]", "frames=1-9"]
+    )
+    check_camera(shot, "shot.json", [1, 4, 6, 9])
+    with pytest.raises(InputError, match=r"^shot\.json: camera: .* no view at frame 5; part"):
+        check_camera(shot, "shot.json", shot.frame_numbers)
+
+
 @pytest.mark.parametrize(
     ("setting", "field", "said"),
     [
@@ -111,7 +123,7 @@ def test_camera_keys_are_linear_and_hold_at_the_ends(shot_file: Path) -> None:
         ("volumes.0.anisotropy=1", "volumes.0.anisotropy", "less than 1"),
         ("volumes.3.extinction=1", "--set volumes.3", "no index below 1"),
         ("camera.fov=180", "camera.fov", "between 0 and 180"),
-        ("camera.look_at=[0.15, 0.12, 1.9]", "camera", "span no view"),
+        ("camera.look_at=[0.15, 0.12, 1.9]", "camera", "span no view; part"),
         ("lights.0.direction=[0.0, 0.0, 0.0]", "lights.0.direction", "must not be zero"),
         ("lights.0.type=spot", "lights.0", "'distant', 'dome'"),
         ("lights.1.radiance=[-1.0, 0.0, 0.0]", "lights.1.radiance.0", "greater than or equal"),

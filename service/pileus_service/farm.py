@@ -28,7 +28,7 @@ from pileus_service.jobs import (
 from pileus_service.queue import Queue, Verb
 from pileus_service.roots import Roots
 from pileus_service.shot import Shot
-from pileus_service.shotfile import check_files
+from pileus_service.shotfile import check_camera, check_files
 from pileus_service.store import Store
 from pileus_service.webhooks import Webhooks, hooks_from_environment
 
@@ -64,6 +64,7 @@ class Farm:
         shot = shot.anchored(self.roots.first)
         numbers = shot.frame_numbers
         self.roots.check(shot, numbers)
+        check_camera(shot, shot.name, numbers)
         check_files(shot, shot.name, numbers, caches=not wait_for_caches)
         if webhook is not None:
             self.hooks.check(webhook)

@@ -2,7 +2,8 @@
 
 import difflib
 import math
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
@@ -159,20 +160,24 @@ class Camera(Model):
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> Self:
-        for frame in self._key_frames():
-            pose = self.at(frame)
-            ahead = tuple(b - a for a, b in zip(pose.position, pose.look_at, strict=True))
-            if _length(_cross(ahead, pose.up)) <= 1e-9 * _length(ahead) * _length(pose.up):
-                raise ValueError(
-                    f"position, look_at and up span no view at frame {frame}; part them"
-                )
+        if not self._moves and not self._sees_at(0):
+            raise ValueError("position, look_at and up span no view; part them")
         return self
 
-    def _key_frames(self) -> Iterator[int]:
-        yield 0
-        for value in (self.position, self.look_at, self.up):
-            if value and isinstance(value[0], Key):
-                yield from (int(key.frame) for key in value if isinstance(key, Key))
+    def first_blind(self, frames: Iterable[int]) -> int | None:
+        """The first of the frames at which a camera that moves has nothing to look along."""
+        if not self._moves:
+            return None
+        return next((frame for frame in frames if not self._sees_at(frame)), None)
+
+    @property
+    def _moves(self) -> bool:
+        return any(isinstance(v, list) for v in (self.position, self.look_at, self.up))
+
+    def _sees_at(self, frame: int) -> bool:
+        pose = self.at(frame)
+        ahead = tuple(b - a for a, b in zip(pose.position, pose.look_at, strict=True))
+        return _length(_cross(ahead, pose.up)) > 1e-9 * _length(ahead) * _length(pose.up)
 
 
 class DistantLight(Model):
@@ -356,12 +361,12 @@ def _number_at(value: float | list[Key[float]], frame: int) -> float:
 
 def _around(keys: list[Key[Value]], frame: int) -> tuple[Key[Value], Key[Value], float]:
     """The keys about a frame and how far it lies between them; the ends hold."""
-    if frame <= keys[0].frame:
-        return keys[0], keys[0], 0.0
-    for before, after in pairwise(keys):
-        if frame <= after.frame:
-            return before, after, (frame - before.frame) / (after.frame - before.frame)
-    return keys[-1], keys[-1], 0.0
+    index = bisect_left(keys, float(frame), key=lambda key: key.frame)
+    if index in (0, len(keys)):
+        end = keys[min(index, len(keys) - 1)]
+        return end, end, 0.0
+    before, after = keys[index - 1], keys[index]
+    return before, after, (frame - before.frame) / (after.frame - before.frame)
 
 
 def _cross(u: tuple[float, ...], v: tuple[float, ...]) -> tuple[float, float, float]:

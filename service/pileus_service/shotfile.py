@@ -32,6 +32,15 @@ def parse_shot(data: Any, source: str) -> Shot:
         raise InputError(one_line(source, error)) from None
 
 
+def check_camera(shot: Shot, source: str, frames: Iterable[int]) -> None:
+    """Refuses a camera that goes blind on its way from key to key."""
+    frame = shot.camera.first_blind(frames)
+    if frame is not None:
+        raise InputError(
+            f"{source}: camera: position, look_at and up span no view at frame {frame}; part them"
+        )
+
+
 def check_files(shot: Shot, source: str, frames: Iterable[int], *, caches: bool = True) -> None:
     """Refuses a shot whose inputs are missing or whose output cannot be written; caches may be
     missing where they are waited for."""

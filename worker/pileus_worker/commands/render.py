@@ -16,7 +16,7 @@ from pileus_service.jobs import Resolved
 from pileus_service.options import AsJson, Frames, Sets, ShotFile
 from pileus_service.progress import Display, Row, duration
 from pileus_service.shot import Shot
-from pileus_service.shotfile import check_files, load_shot
+from pileus_service.shotfile import check_camera, check_files, load_shot
 from pileus_worker import deciding, machine, scene
 from pileus_worker.caches import Caches
 from pileus_worker.denoising import check_installed, denoise
@@ -41,6 +41,7 @@ def render(
     if out is not None:
         output = str(out.resolve() / Path(shot.image.output).name)
         shot = shot.model_copy(update={"image": shot.image.model_copy(update={"output": output})})
+    check_camera(shot, str(shot_file), shot.frame_numbers)
     check_files(shot, str(shot_file), shot.frame_numbers)
     check_installed(shot, str(shot_file))
     for warning in shot.warnings():
