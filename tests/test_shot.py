@@ -122,6 +122,7 @@ def test_a_camera_that_goes_blind_between_its_keys_is_refused_with_the_frame(
         ("volumes.0.albedo=[1.0, 1.0, 1.5]", "volumes.0.albedo.2", "less than or equal to 1"),
         ("volumes.0.anisotropy=1", "volumes.0.anisotropy", "less than 1"),
         ("volumes.3.extinction=1", "--set volumes.3", "no index below 1"),
+        ("transport.looks.0.a=0.5", "--set transport.looks.0.a", "it, transport.looks=[...]"),
         ("camera.fov=180", "camera.fov", "between 0 and 180"),
         ("camera.look_at=[0.15, 0.12, 1.9]", "camera", "span no view; part"),
         ("lights.0.direction=[0.0, 0.0, 0.0]", "lights.0.direction", "must not be zero"),

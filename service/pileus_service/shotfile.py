@@ -140,6 +140,11 @@ def _override(data: dict[str, Any], setting: str) -> None:
         elif isinstance(here, dict):
             if last:
                 here[step] = value
+            elif step not in here and steps[index + 1].isdecimal():
+                whole = ".".join(steps[: index + 1])
+                raise InputError(
+                    f"--set {setting}: the shot has no {whole}; write all of it, {whole}=[...]"
+                )
             else:
                 here = here.setdefault(step, {})
         else:
