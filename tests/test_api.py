@@ -172,6 +172,8 @@ def test_wrong_input_is_a_problem_that_points_at_the_field(
     wrong = {**shot, "volumes": [{**shot["volumes"][0], "extinction": -1}]}
     [error] = client.post("/v1/jobs", json={"shot": wrong}).json()["errors"]
     assert error["pointer"] == "/body/shot/volumes/0/extinction"
+    wrong = {**shot, "image": 3}
+    assert "must be a table" in problem(client.post("/v1/jobs", json={"shot": wrong}), 422)
     problem(
         client.post("/v1/jobs", content=b"{", headers={"content-type": "application/json"}), 422
     )

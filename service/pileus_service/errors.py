@@ -46,7 +46,7 @@ def one_line(source: str, error: ValidationError) -> str:
     # The tag of a union member ("distant") is part of pydantic's location, not of the file's.
     parts = [str(part) for part in first["loc"] if part not in _UNION_TAGS]
     where = ".".join(parts)
-    message = first["msg"].removeprefix("Value error, ")
+    message = in_plain_words(first)
     value = first["input"]
     shown = f" = {value!r:.80}" if isinstance(value, str | int | float) and where else ""
     more = f" (and {len(others)} more)" if others else ""
@@ -67,4 +67,23 @@ def own_troubles(errors: Sequence[Any]) -> list[Any]:
     return [error for error in errors if not follows(error)]
 
 
+def in_plain_words(error: Any) -> str:
+    """What one of pydantic's errors says, without its talk of tuples and tags."""
+    if words := _WORDS.get(error["type"]):
+        return words.format_map(error.get("ctx", {}))
+    return str(error["msg"]).removeprefix("Value error, ")
+
+
+_A_LIST = "must be a list; put it into brackets, [...]"
+_A_TABLE = "must be a table; give its keys with their values"
+_WORDS = {
+    "tuple_type": _A_LIST,
+    "list_type": _A_LIST,
+    "too_short": "has {actual_length} items; give at least {min_length}",
+    "too_long": "has more than {max_length} items; take some out",
+    "model_type": _A_TABLE,
+    "model_attributes_type": _A_TABLE,
+    "union_tag_not_found": "has no {discriminator}; give one, as 'distant' or 'dome'",
+    "union_tag_invalid": "{discriminator} is '{tag:.80}'; give one of {expected_tags}",
+}
 _UNION_TAGS = {"distant", "dome", "constant", "keyed"}

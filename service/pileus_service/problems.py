@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pileus_service.errors import ForeignError, InputError, own_troubles
+from pileus_service.errors import ForeignError, InputError, in_plain_words, own_troubles
 from pileus_service.headers import HEADERS
 from pileus_service.queue import trouble
 
@@ -81,7 +81,7 @@ def install(app: FastAPI) -> None:
         errors = [
             FieldError(
                 pointer="/" + "/".join(str(part) for part in each["loc"]),
-                detail=each["msg"].removeprefix("Value error, "),
+                detail=in_plain_words(each),
             )
             for each in own_troubles(error.errors())[:20]
         ]
