@@ -99,11 +99,12 @@ def _check_writable(folder: Path, source: str) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: over {MAX_BYTES} bytes; is this a shot?")
-        text = path.read_text(encoding="utf-8")
-        data = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
+        data = json.loads(text) if kind == "JSON" else tomllib.loads(text)
     except OSError as error:
         raise InputError(
             f"{path}: {(error.strerror or 'unreadable').lower()}; mend the path"
@@ -111,7 +112,6 @@ def _read(path: Path) -> dict[str, Any]:
     except InputError:
         raise
     except (ValueError, RecursionError) as error:  # the parsers' own, and endless digits and nests
-        kind = "JSON" if path.suffix == ".json" else "TOML"
         raise InputError(f"{path}: is not {kind}: {error}"[:500]) from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: a shot is a table of name, frames, image, ...")

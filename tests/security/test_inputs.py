@@ -214,6 +214,10 @@ def test_toml_and_json_say_the_same(
     assert tomllib.loads(text) == data
     (tmp_path / "a.toml").write_text(text, encoding="utf-8")
     assert load_shot(tmp_path / "a.toml") == load_shot(tmp_path / "a.json")
+    # As an editor of another system may write them.
+    (tmp_path / "b.toml").write_text(text, encoding="utf-8-sig")
+    (tmp_path / "b.JSON").write_text(json.dumps(data), encoding="utf-8-sig")
+    assert load_shot(tmp_path / "b.toml") == load_shot(tmp_path / "b.JSON")
 
 
 def without(path: str, value: Any) -> dict[str, Any]:
