@@ -49,6 +49,7 @@ def test_render_writes_each_frame_and_reports_it(shot_file: Path, tmp_path: Path
     assert report.keys() == {
         "frame", "file", "seconds", "load_seconds", "render_seconds",
         "samples", "error", "unmet_buckets", "method", "max_bounces", "reason", "bounded_paths",
+        "warnings",
     }  # fmt: skip
     assert (report["frame"], report["samples"], report["max_bounces"]) == (2, 4, 4)
     [channels] = core.read_image(str(tmp_path / "out" / "test.0002.exr")).values()

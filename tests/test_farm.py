@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pileus_core as core
 import pytest
 from redis import Redis
@@ -86,13 +87,17 @@ def finish(client: Client, job: str) -> JobView:
     return view
 
 
-def rendered_here(shot: Shot, tmp_path: Path) -> list[dict[str, Any]]:
-    """What `pileus render` reports of each frame, rendered into the folder `here`."""
+def render_here(shot: Shot, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+    """Has `pileus render` render into the folder `here`, and report as JSON."""
     file = tmp_path / "shot.json"
     file.write_text(shot.model_dump_json())
     command = [str(PILEUS), "render", str(file), "--out", str(tmp_path / "here"), "--json"]
-    ended = subprocess.run(command, check=True, capture_output=True, text=True)
-    reports: list[dict[str, Any]] = json.loads(ended.stdout)["frames"]
+    return subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+def rendered_here(shot: Shot, tmp_path: Path) -> list[dict[str, Any]]:
+    """What `pileus render` reports of each frame."""
+    reports: list[dict[str, Any]] = json.loads(render_here(shot, tmp_path).stdout)["frames"]
     return reports
 
 
@@ -167,6 +172,35 @@ def test_buckets_that_miss_the_tolerance_are_told(
     here = [report["unmet_buckets"] for report in rendered_here(shot, tmp_path)]
     assert min(here) > 0
     assert [frame.unmet_buckets for frame in client.frames(job)] == here
+
+
+def test_what_is_odd_in_caches_and_textures_is_told(
+    client: Client, real_shot: Shot, tmp_path: Path
+) -> None:
+    cache, sky = tmp_path / "odd.vdb", tmp_path / "sky.exr"
+    voxels = np.ones((8, 8, 8), np.float32)
+    voxels[0, 0] = np.nan
+    core.write_grid(str(cache), [((0, 0, 0), voxels)], voxel=(0.1,) * 3, origin=(-0.4,) * 3)
+    texels = np.ones((4, 8), np.float32)
+    texels[1, :3] = -1
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict.fromkeys("RGB", texels)).write(str(sky))
+    odd = real_shot.model_dump(mode="json") | {"frames": "1"}
+    odd["volumes"][0]["cache"] = str(cache)
+    odd["lights"][1]["texture"] = str(sky)
+    shot = Shot.model_validate(odd)
+    job = client.submit(shot).job.id
+    finish(client, job)
+    here = render_here(shot, tmp_path)
+    [report] = json.loads(here.stdout)["frames"]
+    of_cache, of_sky = report["warnings"]
+    assert of_cache.startswith(f"{cache}: ") and "8 NaN voxels" in of_cache
+    assert of_sky.startswith(f"{sky}: ") and "9 values" in of_sky
+    assert [frame.warnings for frame in client.frames(job)] == [report["warnings"]]
+    [planned] = [line for line in client.log(job, 1) if (line.task, line.event) == ("plan", "done")]
+    for warning in report["warnings"]:
+        assert here.stderr.count(f"frame 1: warning: {warning}\n") == 1
+        assert (planned.output or "").count(f"warning: {warning}") == 1
 
 
 def test_killed_workers_change_no_bit(

@@ -188,6 +188,7 @@ class Farm:
                         reason=done.reason,
                         bounded_paths=done.bounded_paths,
                         unmet_buckets=done.unmet_buckets,
+                        warnings=done.warnings,
                     )
                 )
             else:

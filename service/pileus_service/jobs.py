@@ -140,6 +140,7 @@ class Plan(Record):
     parts: list[Part]
     empty: list[Bucket]
     begun: float
+    warnings: list[str] = []  # what is odd in the files, and how it is taken
 
     @property
     def files(self) -> list[Cache]:
@@ -159,6 +160,7 @@ class Done(Record):
     reason: str
     bounded_paths: int = 0
     unmet_buckets: int = 0
+    warnings: list[str] = []
 
 
 class Task(Record):
@@ -275,6 +277,7 @@ class FrameView(Record):
     seconds: float | None = None
     bounded_paths: int = 0
     unmet_buckets: int = 0
+    warnings: list[str] = []
 
 
 class FrameMap(Record):

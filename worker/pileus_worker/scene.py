@@ -55,16 +55,24 @@ def make_camera(shot: Shot, frame: int) -> core.Camera:
 
 
 def make_scene(
-    shot: Shot, frame: int, volume: core.Volume, reading: Opener = as_named
+    shot: Shot,
+    frame: int,
+    volume: core.Volume,
+    reading: Opener = as_named,
+    warn: Callable[[str], None] = lambda warning: None,
 ) -> core.Scene:
+    """The renderer's scene; `warn` hears what is odd in the files of it, whose paths are told and
+    not the locations at which they were opened."""
     medium = shot.volumes[0]
+    for warning in volume.warnings:
+        warn(warning.replace(volume.path, str(cache_path(shot, frame)), 1))
     return core.Scene(
         volume=volume,
         extinction=medium.extinction,
         albedo=medium.albedo,
         anisotropy=medium.anisotropy,
         camera=make_camera(shot, frame),
-        lights=[_light(light, frame, reading) for light in shot.lights],
+        lights=[_light(light, frame, reading, warn) for light in shot.lights],
         width=shot.image.width,
         height=shot.image.height,
         background=shot.image.background,
@@ -72,7 +80,7 @@ def make_scene(
 
 
 def _light(
-    light: DistantLight | DomeLight, frame: int, reading: Opener
+    light: DistantLight | DomeLight, frame: int, reading: Opener, warn: Callable[[str], None]
 ) -> core.DistantLight | core.DomeLight:
     if isinstance(light, DistantLight):
         return core.DistantLight(
@@ -80,8 +88,12 @@ def _light(
         )
     if light.texture is None:
         return core.DomeLight(radiance=light.radiance, texture="")
-    with reading(Path(expand(light.texture, frame))) as location:
-        return core.DomeLight(radiance=light.radiance, texture=location)
+    texture = Path(expand(light.texture, frame))
+    with reading(texture) as location:
+        dome = core.DomeLight(radiance=light.radiance, texture=location)
+    for warning in dome.warnings:
+        warn(warning.replace(location, str(texture), 1))
+    return dome
 
 
 def make_looks(shot: Shot) -> list[core.Look]:

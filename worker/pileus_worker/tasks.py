@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pileus_core as core
 
+from pileus_service.errors import printable
 from pileus_service.jobs import (
     Bucket,
     Cache,
@@ -149,7 +150,10 @@ class Work:
     def _new_plan(self, read: list[Cache], identity: str) -> Plan:
         begun = time.time()
         shot = self.job.shot
-        view = self._scene(read)
+        warnings: list[str] = []
+        view = self._scene(read, lambda told: warnings.append(printable(told)))
+        for warning in warnings:
+            print(f"warning: {warning}", flush=True)  # for the frame's log
         cache, *textures = read
         size = (shot.image.width, shot.image.height)
         samples = shot.sampling.samples
@@ -177,6 +181,7 @@ class Work:
             parts=parts,
             empty=empty,
             begun=begun,
+            warnings=warnings,
         )
 
     @property
@@ -291,6 +296,7 @@ class Work:
                 reason=resolved.reason,
                 bounded_paths=frame.bounded_paths,
                 unmet_buckets=frame.unmet_buckets,
+                warnings=plan.warnings,
             )
         )
         self._tidy(files)
@@ -307,7 +313,9 @@ class Work:
         files.sweep()
         shutil.rmtree(self._staging, ignore_errors=True)
 
-    def _scene(self, read: list[Cache]) -> core.Scene:
+    def _scene(
+        self, read: list[Cache], warn: Callable[[str], None] = lambda warning: None
+    ) -> core.Scene:
         """The scene of its files as they were planned: asked before and after they are read, so
         that no frame is of two caches or textures."""
         shot = self.job.shot
@@ -316,7 +324,7 @@ class Work:
             with self._phase("load"):
                 volume = self.caches.get(read[0], shot.volumes[0].density)
                 here = self.paths.shot(shot)
-                return scene.make_scene(here, self.frame, volume, self.roots.reading)
+                return scene.make_scene(here, self.frame, volume, self.roots.reading, warn)
         finally:
             self._same(read)
 

@@ -99,6 +99,7 @@ function showFacts(view) {
     File: view.file,
     Why: view.state === "done" ? "" : view.reason,
     Noise: view.unmet_buckets ? `above the tolerance in ${view.unmet_buckets} of its buckets` : "",
+    Warnings: view.warnings.join("; "),
   };
   const list = at("#frame dl");
   list.replaceChildren();

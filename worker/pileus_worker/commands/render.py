@@ -73,12 +73,11 @@ class Renderer:
         begun = time.monotonic()
         grid = shot.volumes[0].density
         volume = self._caches.get(scene.cache_of(shot, number), grid)
-        for warning in volume.warnings:
-            self._display.note(f"frame {number}: {warning}")
         if index + 1 < len(self._frames):
             self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
         rendering = time.monotonic()
-        resolved, frame = self._watched(index, number, volume)
+        warnings: list[str] = []
+        resolved, frame = self._watched(index, number, volume, warnings)
         render_seconds = time.monotonic() - rendering
         denoise(frame, shot, self._threads)
         output = shot.output(number)
@@ -110,13 +109,16 @@ class Renderer:
             "max_bounces": resolved.max_bounces,
             "reason": resolved.reason,
             "bounded_paths": frame.bounded_paths,
+            "warnings": warnings,
         }
 
-    def _watched(self, index: int, number: int, volume: core.Volume) -> tuple[Resolved, core.Frame]:
+    def _watched(
+        self, index: int, number: int, volume: core.Volume, warnings: list[str]
+    ) -> tuple[Resolved, core.Frame]:
         """Renders with progress; a Ctrl-C stops the renderer's threads too."""
         control = core.Control()
         with ThreadPoolExecutor(1) as executor:
-            future = executor.submit(self._render, number, volume, control)
+            future = executor.submit(self._render, number, volume, control, warnings)
             try:
                 while not wait([future], 0.1).done:
                     self._show(index, number, control.samples_done)
@@ -128,7 +130,7 @@ class Renderer:
             return future.result()
 
     def _render(
-        self, number: int, volume: core.Volume, control: core.Control
+        self, number: int, volume: core.Volume, control: core.Control, warnings: list[str]
     ) -> tuple[Resolved, core.Frame]:
         shot = self._shot
         self._pixels_done = 0
@@ -141,8 +143,11 @@ class Renderer:
             earlier=self._first,
         )
         self._first = self._first or resolved
+        view = scene.make_scene(shot, number, volume, warn=warnings.append)
+        for warning in warnings:
+            self._display.note(f"frame {number}: warning: {warning}")
         sampler = Sampler(
-            scene.make_scene(shot, number, volume),
+            view,
             shot,
             resolved,
             frame=number,
