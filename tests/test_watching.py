@@ -39,9 +39,13 @@ from pileus_service.jobs import (
 from pileus_service.progress import Display, Row
 from pileus_service.shot import Shot
 from pileus_service.store import Store
+from pileus_worker import child
 from pileus_worker.embedded import EmbeddedFarm, Workers, embedded_farm
 from pileus_worker.logfile import LOG_BYTES
+from pileus_worker.output import Output
+from pileus_worker.paths import NOWHERE_ELSE
 from pileus_worker.private_redis import PrivateRedis
+from pileus_worker.supervisor import Child
 from serial_render import plan_of
 
 PILEUS = str(Path(sys.executable).with_name("pileus"))
@@ -142,6 +146,29 @@ def test_the_metrics_add_up_to_what_was_done(
     assert (metric("tasks_waiting", priority="3"), metric("tasks_held", priority="3")) == (0, 0)
     assert metric("queue_age_seconds", priority="3") == 0
     assert (metric("workers"), metric("workers_busy"), metric("threads_busy")) == (1, 0, 0)
+
+
+def test_a_render_process_tells_nothing_of_a_task_once_it_has_ended(
+    one_frame: Shot, tmp_path: Path
+) -> None:
+    """What it said later would be taken for the next task's: progress that falls back."""
+    job = Job(id="j", created=0, shot=one_frame)
+    Store(tmp_path / "data").create(job, Wish())
+    setup = child.Setup(
+        tmp_path / "data", (tmp_path,), 1, 1 << 28, 1 << 32, 1.0, 60.0, NOWHERE_ELSE
+    )
+    renderer = Child(setup, Output())
+    try:
+        while not renderer.ready(1.0):
+            pass
+        for _ in range(3):
+            renderer.order(child.Order(job, 1, Kind.PLAN, 0, read_ahead=False))
+            while isinstance(told := renderer.hear(1.0), child.Beat | None):
+                pass
+            assert isinstance(told, child.Finished)
+            assert renderer.hear(5 * child.TICK) is None
+    finally:
+        renderer.kill()
 
 
 def test_a_frames_log_is_bounded_and_keeps_the_newest(tmp_path: Path, one_frame: Shot) -> None:

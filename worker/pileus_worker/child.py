@@ -183,7 +183,7 @@ class Life:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="task")
         self._new_work = Work
         self._work: Work | None = None
-        self._saying = threading.Lock()
+        self._saying = threading.RLock()
         self._permitted = threading.Event()
         self._denied = False
         self._told_bytes = 0
@@ -191,12 +191,10 @@ class Life:
     def live(self) -> None:
         self._say(Beat(0, 0))
         while True:
-            work = self._work
             if not self._pipe.poll(TICK):
-                if work is not None:
-                    self._say(Beat(work.control.samples_done, work.steps))
+                self._beat()
                 continue
-            message = self._pipe.recv()
+            message, work = self._pipe.recv(), self._work
             if isinstance(message, Order):
                 self._permitted.clear()
                 self._denied = False
@@ -235,8 +233,15 @@ class Life:
             return Spent(time.process_time() - cpu, self._told_bytes - told, work.phases)
 
         outcome = _outcome(work, spent)
-        self._work = None
-        self._say(outcome)
+        with self._saying:
+            self._work = None
+            self._say(outcome)
+
+    def _beat(self) -> None:
+        """Never after the outcome: the parent would take it for the next task's."""
+        with self._saying:
+            if self._work is not None:
+                self._say(Beat(self._work.control.samples_done, self._work.steps))
 
     def _await_permit(self) -> None:
         """Waits until the parent knows that the lease is ours; if it is not, the task is over."""
