@@ -367,6 +367,25 @@ def test_the_commands_list_all_jobs_hurry_one_and_delete_them(
     assert not [*Store(tmp_path / "farm").folders()]
 
 
+def test_status_tells_what_frames_wait_for(
+    client: Client, farm: EmbeddedFarm, shot: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "400")
+    job = client.submit(Shot.model_validate(shot), wait_for_caches=True).job.id
+    cache = shot["volumes"][0]["cache"]
+    expected = {
+        f"frame {n}: volumes.0.cache: {cache.replace('####', f'{n:04d}')} is not there yet"
+        for n in (1, 2, 3)
+    }
+    told: set[str] = set()
+    end = time.monotonic() + 60
+    while not told >= expected:  # one that is just looked for again is told as planning
+        assert time.monotonic() < end, told
+        ended = CliRunner().invoke(app, ["status", job, "--server", farm.url])
+        assert ended.exit_code == 0, ended.output
+        told = {line.strip() for line in ended.output.splitlines()}
+
+
 def test_the_embedded_farm_ends_cleanly_on_ctrl_c(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [PILEUS, "up", "--workers", "2", "--listen", "127.0.0.1:0", "--data", tmp_path / "farm"],

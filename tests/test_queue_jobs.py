@@ -4,7 +4,7 @@ import time
 
 from redis import Redis
 
-from pileus_service.jobs import JobView, Kind, Wish
+from pileus_service.jobs import JobView, Kind, Waiting, Wish
 from pileus_service.queue import Queue
 from queueing import A, B, do, submit, take, take_all, view
 
@@ -85,6 +85,20 @@ def test_the_time_left_counts_no_time_that_a_job_was_paused(queue: Queue) -> Non
     seen = queue.job("job")
     assert seen and seen.seconds_left is not None
     assert seen.seconds_left < 600
+
+
+def test_no_time_left_is_told_where_all_that_remains_waits_for_its_caches(queue: Queue) -> None:
+    submit(queue, frames=3)
+    for _ in range(2):
+        assert queue.complete(take(queue), "A", Waiting(wait="not there yet"))
+    do(queue, take(queue), tasks=3)
+    do(queue, take(queue))
+    seen = queue.job("job")
+    assert seen and seen.seconds_left is not None
+    while task := queue.claim(A):
+        do(queue, task)
+    seen = queue.job("job")
+    assert seen and (seen.frames_done, seen.seconds_left) == (1, None)
 
 
 def test_the_time_left_of_a_retried_job_counts_no_time_since_it_failed(queue: Queue) -> None:

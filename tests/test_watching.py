@@ -229,7 +229,7 @@ def test_the_grid_has_a_mark_for_every_frame_in_its_place(states: str) -> None:
         frames_failed=0, progress=0.0, samples=0, tasks=0, created=0.0,
     )  # fmt: skip
     page = io.StringIO()
-    Console(file=page, width=100).print(terminal.job_picture(job, frame_map, [], []))
+    Console(file=page, width=100).print(terminal.job_picture(job, frame_map, [], [], []))
     rows = re.findall(r"^ *(\d+) ([·○◐◕●✗ -]+)$", page.getvalue(), re.MULTILINE)
     assert [int(first) for first, _ in rows] == list(range(10, 10 + len(states), terminal.ROW))
     marks = "".join(marks for _, marks in rows).replace(" ", "")
@@ -250,7 +250,7 @@ def test_a_running_job_shows_its_buckets_its_workers_and_the_time_left() -> None
     )  # fmt: skip
     frame_map = FrameMap(frames="7", states="r", width=64, height=96)
     page = io.StringIO()
-    picture = terminal.job_picture(job, frame_map, [], [here, elsewhere])
+    picture = terminal.job_picture(job, frame_map, [], [], [here, elsewhere])
     Console(file=page, width=140).print(picture)
     told = page.getvalue()
     assert "1 h 03 min left" in told
@@ -278,7 +278,7 @@ def test_what_others_have_named_is_shown_as_it_is() -> None:
     for picture, times in (
         (terminal.job_table([job]), 1),
         (terminal.worker_table([busy, aside], {"j": NAME}), 3),
-        (terminal.job_picture(job, frame_map, [failed], []), 2),
+        (terminal.job_picture(job, frame_map, [failed], [], []), 2),
         (terminal.finding_table([finding]), 2),
     ):
         page = io.StringIO()

@@ -111,9 +111,14 @@ def worker_table(workers: Iterable[WorkerView], names: dict[str, str]) -> Table:
 
 
 def job_picture(
-    job: JobView, frame_map: FrameMap, failed: Sequence[FrameView], workers: Sequence[WorkerView]
+    job: JobView,
+    frame_map: FrameMap,
+    failed: Sequence[FrameView],
+    waiting: Iterable[FrameView],
+    workers: Sequence[WorkerView],
 ) -> Group:
-    """A job whole: its progress, its frames as a grid, what is in flight, what went wrong."""
+    """A job whole: its progress, its frames as a grid, what is in flight, what is waited for, what
+    went wrong."""
     head = Table.grid(padding=(0, 2))
     head.add_row(Text(job.name, "bold"), state_text(job.state), Text(job.id, "bright_black"))
     line = Table.grid(padding=(0, 2))
@@ -124,9 +129,9 @@ def job_picture(
     here = [worker for worker in workers if worker.doing and worker.doing.job == job.id]
     if here and job.state is JobState.RUNNING:
         parts += ["", worker_table(here, {})]
-    for frame in failed[:MOST_REASONS]:
-        text = Text(f"frame {frame.frame}: ", "red").append(frame.reason or "", "default")
-        parts.append(Padding(text, (1, 0, 0, 0)))
+    for frame in (*waiting, *failed[:MOST_REASONS]):
+        text = Text(f"frame {frame.frame}: ", STYLES[frame.state])
+        parts.append(Padding(text.append(frame.reason or "", "default"), (1, 0, 0, 0)))
     if len(failed) > MOST_REASONS:
         parts.append(Text(f"and {len(failed) - MOST_REASONS} more that failed", "red"))
     if failed:

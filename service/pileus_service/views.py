@@ -18,6 +18,7 @@ class Row(TypedDict, total=False):
     held: dict[str, str]
     failed: int
     reason: str
+    waiting: int
     flight: dict[str, str]
     active: list[tuple[str, dict[str, str]]]
 
@@ -36,7 +37,10 @@ def job_view(job: str, row: Row, now: float) -> JobView:
         state = JobState.QUEUED
     left = None
     gained = settled - int(held["restored"])
-    if state is JobState.RUNNING and gained > 0:
+    planning = sum(frame.state == "planning" for frame in active)
+    # When caches come nobody knows.
+    held_up = 0 < row["waiting"] == frames - frames_done - failed - planning
+    if state is JobState.RUNNING and gained > 0 and not held_up:
         worked = now - (int(held["started"]) + int(held.get("idle", 0))) / 1000
         left = worked * (frames - settled) / gained
     return JobView(

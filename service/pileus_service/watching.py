@@ -1,5 +1,7 @@
 """Follows a job until it ends, with progress."""
 
+from itertools import takewhile
+
 from rich.console import Console, Group
 from rich.live import Live
 
@@ -34,7 +36,11 @@ def picture(client: Client, job: JobView) -> Group:
     wrong = [index for index, state in enumerate(frame_map.states) if state == "f"]
     failed = [client.frame(job.id, index) for index in wrong[: terminal.MOST_REASONS]]
     failed += [FrameView(frame=numbers[i], state="failed") for i in wrong[terminal.MOST_REASONS :]]
-    return terminal.job_picture(job, frame_map, failed, client.workers())
+    idle = [index for index, state in enumerate(frame_map.states) if state == "."]
+    first = (client.frame(job.id, index) for index in idle[: terminal.MOST_REASONS])
+    # Frames begin in order: those after one that waits for nothing but its turn have not begun.
+    waiting = [*takewhile(lambda frame: frame.state == "waiting" and frame.reason, first)]
+    return terminal.job_picture(job, frame_map, failed, waiting, client.workers())
 
 
 def show_until_ended(client: Client, job: str) -> None:

@@ -1,6 +1,6 @@
 -- The jobs ARGV[2], ARGV[3], ... as they stand, in one reply of JSON: the time, and of each job its
--- fields, how many frames have failed, the first of them and why, what workers have in hand, and the
--- frames under way, each with its fields; false for a job that is not here. Hundreds of small replies
+-- fields, how many frames have failed, the first of them and why, how many wait for their caches, what
+-- workers have in hand, and the frames under way, each with its fields; false for a job that is not here. Hundreds of small replies
 -- would cost their reader far more than they cost Redis.
 local jobs = {}
 for number = 2, #ARGV do
@@ -14,6 +14,7 @@ for number = 2, #ARGV do
     held = held,
     failed = redis.call('HLEN', key .. ':failed'),
     reason = held.first_failed and redis.call('HGET', key .. ':failed', held.first_failed) or nil,
+    waiting = redis.call('HLEN', key .. ':waiting'),
     flight = paired(redis.call('HGETALL', key .. ':flight')),
     active = active,
   } or false
