@@ -261,6 +261,19 @@ def test_a_running_job_shows_its_buckets_its_workers_and_the_time_left() -> None
     assert "nimbus" not in told
 
 
+def test_nothing_of_a_paused_job_is_shown_at_work() -> None:
+    active = FrameView(frame=7, state="rendering", tasks=9, tasks_done=4, progress=0.5)
+    job = JobView(
+        id="j", name="n", state=JobState.PAUSED, priority=5, frames=1, frames_done=0,
+        frames_failed=0, progress=0.5, samples=0, tasks=0, created=0.0, active=[active],
+    )  # fmt: skip
+    page = io.StringIO()
+    frame_map = FrameMap(frames="7", states="r", width=64, height=96)
+    Console(file=page, width=140).print(terminal.job_picture(job, frame_map, [], [], []))
+    assert re.search(r"7 +paused .* 4 of 9", page.getvalue())
+    assert "rendering" not in page.getvalue()
+
+
 NAME = "plume[/wip] [red] :cloud:"
 
 

@@ -34,6 +34,7 @@ _LETTERS = {
     "p": ("planning", "○"),
     "r": ("rendering", "◐"),
     "m": ("merging", "◕"),
+    "h": ("paused", "◌"),
     "d": ("done", "●"),
     "f": ("failed", "✗"),
     "c": ("cancelled", "-"),
@@ -50,6 +51,11 @@ def describe(job: JobView) -> str:
         text += f", {job.frames_failed} failed"
     text += f", {job.samples / 1e6:.1f} M samples"
     return ", ".join(filter(None, (text, time_text(job))))
+
+
+def in_flight(job: JobView, frame: FrameView) -> str:
+    """What becomes of a frame of the job's that has begun."""
+    return "paused" if job.state is JobState.PAUSED else frame.state
 
 
 def state_text(state: str) -> Text:
@@ -119,13 +125,16 @@ def job_picture(
 ) -> Group:
     """A job whole: its progress, its frames as a grid, what is in flight, what is waited for, what
     went wrong."""
+    if job.state is JobState.PAUSED:
+        held = frame_map.states.translate(str.maketrans("prm", "hhh"))
+        frame_map = frame_map.model_copy(update={"states": held})
     head = Table.grid(padding=(0, 2))
     head.add_row(Text(job.name, "bold"), state_text(job.state), Text(job.id, "bright_black"))
     line = Table.grid(padding=(0, 2))
     line.add_row(bar(job.progress, job.state, 20), f"{job.progress:.0%}", describe(job))
     parts: list[RenderableType] = [head, line, "", _grid(frame_map)]
     if job.active:
-        parts += ["", _frames(job.active)]
+        parts += ["", _frames(job)]
     here = [worker for worker in workers if worker.doing and worker.doing.job == job.id]
     if here and job.state is JobState.RUNNING:
         parts += ["", worker_table(here, {})]
@@ -161,7 +170,7 @@ def _grid(frame_map: FrameMap) -> Group:
         marks = Text()
         for index in range(begin, min(begin + ROW * step, len(numbers)), step):
             states = frame_map.states[index : index + step]
-            name, mark = _LETTERS[next(letter for letter in "frmp.cd" if letter in states)]
+            name, mark = _LETTERS[next(letter for letter in "frmph.cd" if letter in states)]
             marks.append(mark, STYLES[name])
             if (index // step + 1) % 10 == 0:
                 marks.append(" ")
@@ -173,12 +182,13 @@ def _grid(frame_map: FrameMap) -> Group:
     return Group(grid, key)
 
 
-def _frames(active: Iterable[FrameView]) -> Table:
+def _frames(job: JobView) -> Table:
     table = _table("frame", "", "", "tasks")
-    for frame in active:
+    for frame in job.active:
         tasks = f"{frame.tasks_done} of {frame.tasks}" if frame.tasks else ""
-        state = Text(frame.state, STYLES[frame.state])
-        table.add_row(str(frame.frame), state, bar(frame.progress, frame.state), tasks)
+        state = in_flight(job, frame)
+        told = Text(state, STYLES[state])
+        table.add_row(str(frame.frame), told, bar(frame.progress, state), tasks)
     return table
 
 

@@ -10,7 +10,7 @@ from pileus_service.client import Client
 from pileus_service.frames import parse_frames
 from pileus_service.jobs import FrameView, JobView
 from pileus_service.progress import Display, Row
-from pileus_service.terminal import describe
+from pileus_service.terminal import describe, in_flight
 
 
 def wait_for(client: Client, job: JobView) -> JobView:
@@ -19,14 +19,14 @@ def wait_for(client: Client, job: JobView) -> JobView:
         for view in client.watch(job.id):
             job = view
             whole = Row(job.name, job.progress, describe(job))
-            display.show(whole, *map(_frame_row, job.active))
+            display.show(whole, *(_frame_row(job, frame) for frame in job.active))
         display.note(f"{job.name}: {job.state}, {describe(job)}")
     return job
 
 
-def _frame_row(frame: FrameView) -> Row:
+def _frame_row(job: JobView, frame: FrameView) -> Row:
     tasks = f"{frame.tasks_done} of {frame.tasks} tasks" if frame.tasks else ""
-    return Row(f"  frame {frame.frame}", frame.progress, f"{frame.state} {tasks}")
+    return Row(f"  frame {frame.frame}", frame.progress, f"{in_flight(job, frame)} {tasks}")
 
 
 def picture(client: Client, job: JobView) -> Group:
