@@ -386,6 +386,42 @@ def test_status_tells_what_frames_wait_for(
         told = {line.strip() for line in ended.output.splitlines()}
 
 
+def test_who_waits_for_a_job_knows_it_and_that_it_goes_on(
+    client: Client, farm: EmbeddedFarm, shot: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "shot.json").write_text(json.dumps(shot))
+    waiting = ["--wait", "--wait-for-caches", "--server", farm.url]
+    process = subprocess.Popen(
+        [PILEUS, "submit", tmp_path / "shot.json", *waiting], stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    job, _, told = process.stderr.readline().partition(": ")
+    assert told == "taken\n"
+    assert client.job(job).name == shot["name"]
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 128 + signal.SIGINT
+    assert f"{job} goes on; `pileus status {job}`" in errors
+    assert client.job(job).state in ("queued", "running")
+
+
+def test_steering_that_does_nothing_says_so(
+    client: Client, farm: EmbeddedFarm, shot: dict[str, Any]
+) -> None:
+    def told(*words: str) -> str:
+        ended = CliRunner().invoke(app, [*words, "--server", farm.url])
+        assert ended.exit_code == 0, ended.output
+        return ended.output.splitlines()[-1]
+
+    job = client.submit(Shot.model_validate(shot), wait_for_caches=True).job.id
+    assert told("retry", job).endswith("no frame failed; nothing to retry")
+    assert told("pause", job) == f"{job}: paused"
+    assert told("cancel", job) == f"{job}: cancelled"
+    for verb in ("cancel", "pause", "resume"):
+        assert told(verb, job) == f"{job}: cancelled already; nothing to {verb}"
+    assert told("priority", job, "9") == f"{job}: cancelled already; its priority stays 5"
+
+
 def test_the_embedded_farm_ends_cleanly_on_ctrl_c(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [PILEUS, "up", "--workers", "2", "--listen", "127.0.0.1:0", "--data", tmp_path / "farm"],

@@ -16,10 +16,15 @@ from pileus_service.terminal import describe, in_flight
 def wait_for(client: Client, job: JobView) -> JobView:
     """Shows a job until it ends, its frames in flight below it; returns it as it ended."""
     with Display() as display:
-        for view in client.watch(job.id):
-            job = view
-            whole = Row(job.name, job.progress, describe(job))
-            display.show(whole, *(_frame_row(job, frame) for frame in job.active))
+        display.note(f"{job.id}: taken")
+        try:
+            for view in client.watch(job.id):
+                job = view
+                whole = Row(job.name, job.progress, describe(job))
+                display.show(whole, *(_frame_row(job, frame) for frame in job.active))
+        except KeyboardInterrupt:
+            display.note(f"{job.id} goes on; `pileus status {job.id}` shows it")
+            raise
         display.note(f"{job.name}: {job.state}, {describe(job)}")
     return job
 

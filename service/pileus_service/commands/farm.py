@@ -13,7 +13,7 @@ from rich.console import Console
 from pileus_service import terminal
 from pileus_service.client import Client
 from pileus_service.errors import FarmError, printable
-from pileus_service.jobs import JobState
+from pileus_service.jobs import TERMINAL, JobState
 from pileus_service.options import LISTEN, AsJson, Frames, Server, Sets, ShotFile, Token
 from pileus_service.shotfile import load_shot
 from pileus_service.watching import picture, show_until_ended, wait_for
@@ -124,9 +124,14 @@ def _verb(verb: Literal["cancel", "pause", "resume", "retry"], text: str) -> Non
         job: JobArgument, server: Server = LOCAL, token: Token = None, as_json: AsJson = False
     ) -> None:
         with Client(server, token) as client:
+            before = client.job(job)
             view = client.control(job, verb)
         if as_json:
             _print_json(view)
+        elif verb == "retry" and before.frames_failed == 0:
+            print(f"{view.id}: {view.state}, and no frame failed; nothing to retry")
+        elif before.state in TERMINAL and before.state == view.state:
+            print(f"{view.id}: {view.state} already; nothing to {verb}")
         else:
             print(f"{view.id}: {view.state}")
 
@@ -152,6 +157,8 @@ def set_priority(
         view = client.set_priority(job, priority)
     if as_json:
         _print_json(view)
+    elif view.state in TERMINAL:
+        print(f"{view.id}: {view.state} already; its priority stays {view.priority}")
     else:
         print(f"{view.id}: priority {view.priority}")
 
