@@ -1,5 +1,6 @@
 """The commands that need no farm: what they write, what they refuse, how they end."""
 
+import contextlib
 import json
 import os
 import resource
@@ -139,10 +140,14 @@ def test_make_writes_a_sequence(tmp_path: Path) -> None:
 def test_making_ends_when_it_is_interrupted(tmp_path: Path) -> None:
     command = [PILEUS, "make", "cloud", str(tmp_path / "c.####.vdb"), "--frames", "1-9"]
     begun = subprocess.Popen([*command, "--resolution", "900"], start_new_session=True)
-    time.sleep(3)
-    os.killpg(begun.pid, signal.SIGINT)  # as a terminal does
-    # A frame takes longer, nine of them many minutes.
-    assert begun.wait(timeout=60) == 128 + signal.SIGINT
+    try:
+        time.sleep(3)
+        os.killpg(begun.pid, signal.SIGINT)  # as a terminal does
+        # A frame takes longer, nine of them many minutes.
+        assert begun.wait(timeout=60) == 128 + signal.SIGINT
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(begun.pid, signal.SIGKILL)
     assert not list(tmp_path.glob("*.vdb"))
 
 

@@ -85,12 +85,12 @@ def make(
             min(machine.cores(), len(numbers)), multiprocessing.get_context("spawn")
         ) as pool,
     ):
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
-        jobs = [
-            pool.submit(_frame, subject, expand(out, number), number, action, resolution, seed)
-            for number in numbers
-        ]
         try:
+            Path(out).parent.mkdir(parents=True, exist_ok=True)
+            jobs = [
+                pool.submit(_frame, subject, expand(out, number), number, action, resolution, seed)
+                for number in numbers
+            ]
             for done, job in enumerate(as_completed(jobs), 1):
                 voxels += job.result()
                 detail = f"{done} of {len(jobs)} frames"
