@@ -139,7 +139,12 @@ def test_make_writes_a_sequence(tmp_path: Path) -> None:
 
 def test_making_ends_when_it_is_interrupted(tmp_path: Path) -> None:
     command = [PILEUS, "make", "cloud", str(tmp_path / "c.####.vdb"), "--frames", "1-9"]
-    begun = subprocess.Popen([*command, "--resolution", "900"], start_new_session=True)
+    begun = subprocess.Popen(
+        [*command, "--resolution", "900"],
+        start_new_session=True,
+        # A shell has what it starts in the background ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     try:
         time.sleep(3)
         os.killpg(begun.pid, signal.SIGINT)  # as a terminal does

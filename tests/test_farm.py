@@ -392,7 +392,11 @@ def test_who_waits_for_a_job_knows_it_and_that_it_goes_on(
     (tmp_path / "shot.json").write_text(json.dumps(shot))
     waiting = ["--wait", "--wait-for-caches", "--server", farm.url]
     process = subprocess.Popen(
-        [PILEUS, "submit", tmp_path / "shot.json", *waiting], stderr=subprocess.PIPE, text=True
+        [PILEUS, "submit", tmp_path / "shot.json", *waiting],
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell has what it starts in the background ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stderr is not None
     job, _, told = process.stderr.readline().partition(": ")
