@@ -25,15 +25,16 @@ PILOT_SHARE = 0.0125  # of the pixel samples that the frame seems to need
 DENOISED_SHARE = 0.0625  # of that share, where the frame is denoised and will take far fewer
 PILOT_SAMPLES = 64  # of a pixel, at most
 PILOT_ORDERS = 32
-BIAS_SHARE = 0.3  # of those: `reference`, which the bias is told by, takes several times as long
+# Of the pilot's samples: `reference`, by which similarity's bias is told, takes its time.
+BIAS_SHARE = 0.3
 BLOCK = 4
 # The RMS bias of `similarity` under a sun alone, by the event from which it reduces, as it usually
 # is (docs/methods.md); under a plain sky alone it was never seen to be over SKY_BIAS.
 SIMILARITY_BIAS = {2: 0.042, 3: 0.030, 6: 0.025}
 SKY_BIAS = 0.005
 MOST_BIAS = 0.6  # of the tolerance: about a third of its square
-# So many standard errors must a bias that the pilot sees be over the usual one. With one, every
-# third noisy pilot would see one where there is none; with two, the noisiest would see no fog.
+# So many standard errors must a bias that the pilot sees be over the usual one. With one, pilots of
+# few samples saw one where there is none; more would hide one that is there.
 CLEAR = 1.5
 Planes = NDArray[np.float32]
 # A decision stands along a sequence until the measure has left its limit by as much.

@@ -25,6 +25,9 @@ from pileus_worker.sampling import Sampler
 
 app = typer.Typer()
 
+# What was decided, the frame, and what is odd in its files.
+Rendered = tuple[Resolved, core.Frame, list[str]]
+
 
 @app.command("render")
 def render(
@@ -76,8 +79,7 @@ class Renderer:
         if index + 1 < len(self._frames):
             self._caches.read_ahead(scene.cache_of(shot, self._frames[index + 1]), grid)
         rendering = time.monotonic()
-        warnings: list[str] = []
-        resolved, frame = self._watched(index, number, volume, warnings)
+        resolved, frame, warnings = self._watched(index, number, volume)
         render_seconds = time.monotonic() - rendering
         denoise(frame, shot, self._threads)
         output = shot.output(number)
@@ -112,13 +114,11 @@ class Renderer:
             "warnings": warnings,
         }
 
-    def _watched(
-        self, index: int, number: int, volume: core.Volume, warnings: list[str]
-    ) -> tuple[Resolved, core.Frame]:
+    def _watched(self, index: int, number: int, volume: core.Volume) -> Rendered:
         """Renders with progress; a Ctrl-C stops the renderer's threads too."""
         control = core.Control()
         with ThreadPoolExecutor(1) as executor:
-            future = executor.submit(self._render, number, volume, control, warnings)
+            future = executor.submit(self._render, number, volume, control)
             try:
                 while not wait([future], 0.1).done:
                     self._show(index, number, control.samples_done)
@@ -129,9 +129,7 @@ class Renderer:
                 raise
             return future.result()
 
-    def _render(
-        self, number: int, volume: core.Volume, control: core.Control, warnings: list[str]
-    ) -> tuple[Resolved, core.Frame]:
+    def _render(self, number: int, volume: core.Volume, control: core.Control) -> Rendered:
         shot = self._shot
         self._pixels_done = 0
         resolved = deciding.resolve(
@@ -143,6 +141,7 @@ class Renderer:
             earlier=self._first,
         )
         self._first = self._first or resolved
+        warnings: list[str] = []
         view = scene.make_scene(shot, number, volume, warn=warnings.append)
         for warning in warnings:
             self._display.note(f"frame {number}: warning: {warning}")
@@ -154,7 +153,7 @@ class Renderer:
             threads=self._threads,
             control=control,
         )
-        return resolved, sampler.whole(self._count)
+        return resolved, sampler.whole(self._count), warnings
 
     def _count(self, pixels: int) -> None:
         self._pixels_done += pixels
