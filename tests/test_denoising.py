@@ -87,12 +87,31 @@ def test_images_of_any_shape_are_denoised(
 
 
 @pytest.mark.parametrize("quality", get_args(Quality))
-@pytest.mark.parametrize("size", [(1, 1), (200, 3), (64, 48)])
+@pytest.mark.parametrize("size", [(1, 1), (200, 3), (64, 48), (56, 40)])
 def test_nothing_from_beyond_the_image_is_drawn_in(size: tuple[int, int], quality: Quality) -> None:
-    color = np.broadcast_to(np.array([0.2, 0.3, 0.5], np.float32), (*size, 3)).copy()
+    ripple = np.where(np.indices(size).sum(axis=0) % 2, 1.0, 1.01)[..., np.newaxis]
+    color = np.asarray(ripple * [0.2, 0.3, 0.5], np.float32)
     guide = np.full((*size, 3), 0.5, np.float32)
     found = Filter(2)({"color": color, "albedo": guide}, quality)
-    np.testing.assert_allclose(found, color, rtol=0.03)
+    np.testing.assert_allclose(found, color, rtol=0.04)
+
+
+def test_a_plain_sky_is_left_as_it_is_and_what_stands_in_it_is_the_same_anywhere() -> None:
+    noise = np.random.default_rng(4).exponential(size=(30, 21, 3)).astype(np.float32)
+    sky = np.array([0.2, 0.3, 0.5], np.float32)
+    filtered = []
+    for row, column in [(20, 20), (47, 33)]:
+        color, guide = (np.tile(of, (100, 90, 1)).astype(np.float32) for of in (sky, [0.5] * 3))
+        place = np.s_[row : row + 30, column : column + 21]
+        color[place], guide[place] = noise, 1.0
+        found = Filter(2)({"color": color, "albedo": guide}, "FAST")
+        filtered.append(found[place].copy())
+        found[place] = color[place]
+        np.testing.assert_array_equal(found, color)
+    np.testing.assert_array_equal(filtered[0], filtered[1])
+    assert np.var(filtered[0]) < 0.1 * np.var(noise)
+    alone = np.broadcast_to(sky, (5, 7, 3))
+    np.testing.assert_array_equal(Filter(1)({"color": alone, "albedo": alone}, "FAST"), alone)
 
 
 @pytest.mark.parametrize(

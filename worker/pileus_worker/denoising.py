@@ -4,6 +4,7 @@ The one guide image is made of the frame's own opacity: it tells the filter wher
 What other guides bring to volumes, and what they cost, is measured in docs/denoising.md.
 """
 
+from collections.abc import Iterable
 from importlib.util import find_spec
 from typing import Any, Literal
 
@@ -18,9 +19,11 @@ Pixels = NDArray[np.float32]
 Quality = Literal["FAST", "HIGH"]  # as OIDN calls its networks; BALANCED is HIGH on a CPU
 FEW_SAMPLES = 4
 LOOSE_TOLERANCE = 0.04  # which few samples meet, once they are denoised
-# Beyond the image OIDN sees black and draws some of it in: corners came out half as bright. So it
-# is given the image's mirror there. Of 2 to 16 pixels 8 left the least error.
-MARGIN = 8
+# OIDN fills what it is given up to whole squares of so many pixels with black, and draws some of it
+# in. So it is given a margin: the image's own pixels, and where there are none its mirror.
+SQUARE = 16
+MARGIN = 4  # at least, on each side
+ONE_COLOUR = 1e-4  # relative: what adding up samples rounds
 
 
 def check_installed(shot: Shot, source: str) -> None:
@@ -69,12 +72,22 @@ class Filter:
         """Filters a linear `color` of any range with the guides `albedo` and `normal`, or a guide
         alone. All are of shape (height, width, 3 or more) and their first three channels count;
         returns (height, width, 3). Raises FarmError."""
+        filtered: Pixels = next(iter(images.values()))[..., :3].copy()
+        part = _uneven(images.values())
+        if all(side.start < side.stop for side in part):
+            margins = [_margins(side) for side in part]
+            seen = {name: _widened(image, part, margins) for name, image in images.items()}
+            (top, _), (left, _) = margins
+            height, width = (side.stop - side.start for side in part)
+            out = self._run(seen, quality)
+            filtered[part] = out[top : top + height, left : left + width]
+        return filtered
+
+    def _run(self, images: dict[str, Pixels], quality: Quality) -> Pixels:
         oidn = self._oidn
-        edges = ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0))
-        wider = {name: np.pad(image, edges, "symmetric") for name, image in images.items()}
-        output = np.empty((*next(iter(wider.values())).shape[:2], 3), np.float32)
+        output = np.empty((*next(iter(images.values())).shape[:2], 3), np.float32)
         with oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT) as rt:
-            for name, image in {**wider, "output": output}.items():
+            for name, image in {**images, "output": output}.items():
                 stride = image.shape[2] * image.itemsize
                 rt.set_image(name, image, oidn.OIDN_FORMAT_FLOAT3, pixel_byte_stride=stride)
             if "color" in images:
@@ -83,12 +96,45 @@ class Filter:
             rt.commit()
             rt.execute()
             self._check()
-        return np.ascontiguousarray(output[MARGIN:-MARGIN, MARGIN:-MARGIN])
+        return output
 
     def _check(self) -> None:
         error: Any = self._device.get_error()
         if error is not None:
             raise FarmError(f"image.denoise: Open Image Denoise fails: {error}")
+
+
+def _uneven(images: Iterable[Pixels]) -> tuple[slice, slice]:
+    """The rows and columns outside of which each image is all of one colour: a plain sky, or
+    nothing. There is no noise to filter."""
+    uneven = np.any(
+        [
+            (np.abs(image - image[0, 0]) > ONE_COLOUR * np.abs(image[0, 0]))[..., :3].any(axis=-1)
+            for image in images
+        ],
+        axis=0,
+    )
+    if not uneven.any():
+        return slice(0, 0), slice(0, 0)
+    rows, columns = (np.flatnonzero(uneven.any(axis=axis)) for axis in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _margins(side: slice) -> tuple[int, int]:
+    """Before and behind a part, so that it has whole squares."""
+    length = side.stop - side.start
+    spare = -(length + 2 * MARGIN) % SQUARE
+    return MARGIN + spare // 2, MARGIN + spare - spare // 2
+
+
+def _widened(image: Pixels, part: tuple[slice, slice], margins: list[tuple[int, int]]) -> Pixels:
+    """A part of an image with margins; beyond the image they are its mirror."""
+    mirrored = np.pad(image, ((SQUARE, SQUARE), (SQUARE, SQUARE), (0, 0)), "symmetric")
+    rows, columns = (
+        slice(SQUARE + side.start - before, SQUARE + side.stop + behind)
+        for side, (before, behind) in zip(part, margins, strict=True)
+    )
+    return np.ascontiguousarray(mirrored[rows, columns])
 
 
 def guide_of(opacity: Pixels) -> Pixels:
