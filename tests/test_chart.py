@@ -8,8 +8,10 @@ import numpy as np
 import pileus_core as core
 import pytest
 
+from pileus_bench.art_directed import against_single
 from pileus_bench.contenders import PEERS, methods
 from pileus_bench.measures import Truth, errors, relative_noise
+from pileus_bench.process import RendererProcess
 from pileus_bench.run import Measurement, Plan
 from pileus_bench.scenes import AbsentError, dense, load_scene, scene_names
 from pileus_service.shotfile import load_shot
@@ -106,6 +108,14 @@ def test_a_scene_is_measured_and_its_truth_kept(tmp_path: Path) -> None:
         before = kept[0].stat().st_mtime_ns
         measurement.scene(scene, contenders)
         assert [file.stat().st_mtime_ns for file in (tmp_path / "truths").iterdir()] == [before]
+
+
+def test_later_orders_cost_noise_under_a_look_too(tmp_path: Path) -> None:
+    with RendererProcess("pileus", sys.executable) as renderer:
+        bar = against_single(renderer, ["sun", "cumulus"], TINY, tmp_path, tmp_path)
+    assert bar.values.keys() == {"sun"}, "the cumulus is not here"
+    assert bar.mean == pytest.approx(bar.values["sun"])
+    assert 2 < bar.values["sun"] < 50
 
 
 def test_dense_voxels_are_those_that_are_interpolated(tmp_path: Path) -> None:

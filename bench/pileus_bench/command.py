@@ -12,6 +12,7 @@ from typing import Annotated
 import pileus_core as core
 import typer
 
+from pileus_bench.art_directed import against_single
 from pileus_bench.bars import bars_of
 from pileus_bench.contenders import CYCLES_DENOISED, PEERS, methods
 from pileus_bench.end_to_end import denoised_bar, end_to_end
@@ -124,6 +125,8 @@ def chart(
             if out is not None and measurement.points:
                 _write(charted(), out, page)  # an hour's work may be cut short
         pileus = measurement.process("pileus")
+        if {"single", "multiple"} <= set(names):
+            bars.append(against_single(pileus, chosen, plan, data, shared))
         fixed = [each for each in ours if not each.by_tolerance]
         bars.append(refinement(pileus, fixed, plan.repeats, plan.scale, data))
         bars.extend(threads(pileus, fixed, plan.repeats, plan.scale, data))

@@ -5,7 +5,7 @@ from typing import Any
 import pileus_core as core
 
 from pileus_bench.renderers.protocol import Image, serve
-from pileus_service.shot import Shot
+from pileus_service.shot import Shot, Transport
 from pileus_worker import deciding, machine, scene
 from pileus_worker.denoising import denoise
 from pileus_worker.sampling import Sampler
@@ -26,7 +26,9 @@ class Pileus:
         shot, tolerance = self._shot, settings.get("tolerance")
         shot = shot.model_copy(
             update={
-                "transport": shot.transport.model_copy(update=settings["transport"]),
+                "transport": Transport.model_validate(
+                    shot.transport.model_dump() | settings["transport"]
+                ),
                 "sampling": shot.sampling.model_copy(
                     update={"samples": samples, "seed": seed, "tolerance": tolerance}
                 ),
