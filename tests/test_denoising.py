@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pileus_service.shot import Shot
 from pileus_worker import scene
-from pileus_worker.denoising import Filter, Quality, guide_of
+from pileus_worker.denoising import Filter, Quality, denoise, guide_of
 
 pytest.importorskip("pyoidn", reason="Open Image Denoise has no wheel for this machine")
 
@@ -74,6 +74,17 @@ def test_neither_threads_nor_other_looks_change_a_bit(noisy: Shot, tmp_path: Pat
     [one] = rendered(alone, tmp_path / "alone.exr", threads=1).values()
     for name, values in one.items():
         np.testing.assert_array_equal(both["own"][name], values, name)
+
+
+def test_each_look_is_told_of_so_that_many_large_ones_are_no_hang(noisy: Shot) -> None:
+    shot, size = changed(noisy, "image", width=9, height=7, orders=False), (9, 7)
+    view = scene.make_scene(shot, 1, core.Volume(str(scene.cache_path(shot, 1))))
+    transport = core.Transport(method="single", looks=scene.make_looks(shot))
+    frame = core.Frame(*size, [((0, 0, *size), 1)])
+    frame.add(core.render(view, transport, bucket=(0, 0, *size), samples=(0, 1), seed=1, frame=1))
+    told: list[int] = []
+    denoise(frame, shot, 1, lambda: told.append(1))
+    assert len(told) == len(shot.transport.looks)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200)])

@@ -4,7 +4,7 @@ The one guide image is made of the frame's own opacity: it tells the filter wher
 What other guides bring to volumes, and what they cost, is measured in docs/denoising.md.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from typing import Any, Literal
 
@@ -35,14 +35,21 @@ def check_installed(shot: Shot, source: str) -> None:
         )
 
 
-def denoise(frame: core.Frame, shot: Shot, threads: int) -> None:
-    """Puts denoised colours into a frame that is complete, where the shot wants them."""
+def denoise(
+    frame: core.Frame, shot: Shot, threads: int, done: Callable[[], None] = lambda: None
+) -> None:
+    """Puts denoised colours into a frame that is complete, where the shot wants them; `done` hears
+    of each look that is through."""
     if not shot.image.denoise:
         return
-    filter_ = Filter(threads)
-    images = [frame.pixels(look.name) for look in shot.transport.looks]
-    guide, quality = guide_of(images[0][..., 3]), quality_of(shot.sampling)
-    frame.set_denoised([filter_({"color": image, "albedo": guide}, quality) for image in images])
+    filter_, quality = Filter(threads), quality_of(shot.sampling)
+    names = [look.name for look in shot.transport.looks]
+    guide = guide_of(frame.pixels(names[0])[..., 3])
+    filtered = []
+    for name in names:
+        filtered.append(filter_({"color": frame.pixels(name), "albedo": guide}, quality))
+        done()
+    frame.set_denoised(filtered)
 
 
 def quality_of(sampling: Sampling) -> Quality:

@@ -67,7 +67,8 @@ class Work:
     read_ahead: bool
     control: core.Control = field(default_factory=core.Control)
     phases: dict[str, float] = field(default_factory=dict)
-    steps: int = 0  # phases begun and partials read: what gets somewhere renders nothing, at times
+    # What gets somewhere and renders nothing: phases begun, partials read, looks denoised.
+    steps: int = 0
 
     def run(self) -> Result:
         self.roots.check(self.paths.shot(self.job.shot), [self.frame])
@@ -244,7 +245,7 @@ class Work:
         redo, trouble = [], ""
         with self._phase("merge"):
             for index, part in enumerate(plan.parts):
-                self.steps += 1
+                self._step()
                 try:
                     partial = self._read(files, part, plan)
                 except core.InputError as error:
@@ -259,7 +260,7 @@ class Work:
         for partial in self._empty_buckets(plan):
             frame.add(partial)
         with self._phase("denoise"):
-            denoise(frame, shot, self.threads)
+            denoise(frame, shot, self.threads, self._step)
         with self._phase("write"):
             self._write(files, plan, frame)
         return Merged()
@@ -368,10 +369,13 @@ class Work:
             )
             return sampler.parts([bucket], samples)[0]
 
+    def _step(self) -> None:
+        self.steps += 1
+
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         """Adds the seconds of a block to a phase of the task."""
-        self.steps += 1
+        self._step()
         begun = time.perf_counter()
         try:
             yield
