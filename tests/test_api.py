@@ -172,6 +172,11 @@ def test_wrong_input_is_a_problem_that_points_at_the_field(
     wrong = {**shot, "volumes": [{**shot["volumes"][0], "extinction": -1}]}
     [error] = client.post("/v1/jobs", json={"shot": wrong}).json()["errors"]
     assert error["pointer"] == "/body/shot/volumes/0/extinction"
+    sun = {"type": "distant", "direction": [0, -1, 0], "irradiance": [-1, 1, 1]}
+    answer = client.post("/v1/jobs", json={"shot": {**shot, "lights": [sun]}}).json()
+    [error] = answer["errors"]
+    assert error["pointer"] == "/body/shot/lights/0/irradiance/0"
+    assert answer["detail"].startswith("body.shot.lights.0.irradiance.0: ")
     wrong = {**shot, "image": 3}
     assert "must be a table" in problem(client.post("/v1/jobs", json={"shot": wrong}), 422)
     problem(

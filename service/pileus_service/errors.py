@@ -43,9 +43,7 @@ def data_troubles(data: Path) -> Iterator[None]:
 def one_line(source: str, error: ValidationError) -> str:
     """The first trouble of a validation error as one line, with a count of the others."""
     first, *others = own_troubles(error.errors(include_url=False))
-    # The tag of a union member ("distant") is part of pydantic's location, not of the file's.
-    parts = [str(part) for part in first["loc"] if part not in _UNION_TAGS]
-    where = ".".join(parts)
+    where = ".".join(place_of(first))
     message = in_plain_words(first)
     value = first["input"]
     shown = f" = {value!r:.80}" if isinstance(value, str | int | float) and where else ""
@@ -65,6 +63,12 @@ def own_troubles(errors: Sequence[Any]) -> list[Any]:
         )
 
     return [error for error in errors if not follows(error)]
+
+
+def place_of(error: Any) -> list[str]:
+    """Where one of pydantic's errors is: keys and indices from the outside in. The tag of a union's
+    member ("distant") is part of pydantic's location, not of what was given."""
+    return [str(part) for part in error["loc"] if part not in _UNION_TAGS]
 
 
 def in_plain_words(error: Any) -> str:

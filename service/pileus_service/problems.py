@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pileus_service.errors import ForeignError, InputError, in_plain_words, own_troubles
+from pileus_service.errors import ForeignError, InputError, in_plain_words, own_troubles, place_of
 from pileus_service.headers import HEADERS
 from pileus_service.queue import trouble
 
@@ -78,15 +78,12 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     def invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        troubles = own_troubles(error.errors())[:20]
         errors = [
-            FieldError(
-                pointer="/" + "/".join(str(part) for part in each["loc"]),
-                detail=in_plain_words(each),
-            )
-            for each in own_troubles(error.errors())[:20]
+            FieldError(pointer="/" + "/".join(place_of(each)), detail=in_plain_words(each))
+            for each in troubles
         ]
-        first = errors[0]
-        return _answer(422, f"{first.pointer[1:].replace('/', '.')}: {first.detail}", errors)
+        return _answer(422, f"{'.'.join(place_of(troubles[0]))}: {errors[0].detail}", errors)
 
     @app.exception_handler(InputError)
     def refused(_: Request, error: InputError) -> JSONResponse:
