@@ -114,16 +114,12 @@ class Filter:
 def _uneven(images: Iterable[Pixels]) -> tuple[slice, slice]:
     """The rows and columns outside of which each image is all of one colour: a plain sky, or
     nothing. There is no noise to filter."""
-    uneven = np.any(
-        [
-            (np.abs(image - image[0, 0]) > ONE_COLOUR * np.abs(image[0, 0]))[..., :3].any(axis=-1)
-            for image in images
-        ],
-        axis=0,
-    )
-    if not uneven.any():
+    differ = [np.abs(image - image[0, 0]) > ONE_COLOUR * np.abs(image[0, 0]) for image in images]
+    by_row = [each.reshape(len(each), -1).any(axis=1) for each in differ]
+    by_column = [each.any(axis=0).any(axis=1) for each in differ]
+    rows, columns = (np.flatnonzero(np.any(each, axis=0)) for each in (by_row, by_column))
+    if not rows.size:
         return slice(0, 0), slice(0, 0)
-    rows, columns = (np.flatnonzero(uneven.any(axis=axis)) for axis in (1, 0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 

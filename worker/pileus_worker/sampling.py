@@ -26,9 +26,6 @@ GROWTH = 3
 MARGIN = 1.65
 # The buckets whose rounds go together, for threads wait for each other after each.
 TOGETHER = 64
-# What a smoothed image errs by falls more slowly than noise does: as the inverse of this power of
-# the samples or a greater one.
-SMOOTHED_POWER = 0.7
 Halves = list[core.Partial]  # one or two
 
 
@@ -120,7 +117,8 @@ class Sampler:
         if len(halves) == 2:
             half, other = halves
             error = core.smoothed_error(half, other, self._margin(half.bucket)) ** 2
-            wanted = taken * (error / allowed) ** (1 / SMOOTHED_POWER)
+            # As if all of it were noise. What smoothing blurs stays, and another round will tell.
+            wanted = taken * error / allowed
         if wanted > taken:
             error = max(half.relative_error() for half in halves) ** 2 / len(halves)
             needed = error / allowed * taken
