@@ -58,6 +58,8 @@ def test_a_worker_with_another_data_folder_gets_nothing_and_is_told(queue: Queue
     assert queue.serves("ours")
     assert not queue.serves("other")
     lapse(queue)
+    assert queue.claim(B, None, able=False) is None
+    assert [view.aside for view in queue.workers() if view.name == "B"] == [None], "it only starts"
     for farm in ("other", None):
         assert queue.claim(B, farm) is None
     [told] = [view.aside for view in queue.workers() if view.name == "B"]

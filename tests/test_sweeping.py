@@ -139,3 +139,14 @@ def test_what_cannot_be_swept_fails_no_frame(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == [busy]
     finally:
         subprocess.run(["umount", str(busy)], check=True)
+
+
+def test_services_that_begin_a_farm_at_once_agree_on_its_id(tmp_path: Path) -> None:
+    """Each would else find another's id in its place, and refuse all work."""
+    with ThreadPoolExecutor(8) as pool:
+        for number in range(40):
+            stores = [Store(tmp_path / str(number)) for _ in range(8)]
+            begun = {each.result() for each in [pool.submit(store.begin) for store in stores]}
+            assert begun == {stores[0].farm()}
+    (stores[0].root / "farm.json").write_text("{")
+    assert stores[0].begin() == stores[1].farm()

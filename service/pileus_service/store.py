@@ -155,10 +155,11 @@ class Store:
         """The farm's id, made by the first service that begins a farm here."""
         if (held := self.farm()) is not None:
             return held
-        mark = FarmMark(id=secrets.token_hex(8))
-        path = self.root / FARM
-        once = not path.exists()  # a damaged one is made anew
-        write_whole(path, mark.model_dump_json().encode(), once=once)
+        path, mark = self.root / FARM, FarmMark(id=secrets.token_hex(8))
+        # What is there, and still holds no id, is damaged: others who begin write it whole, once.
+        if path.exists() and self.farm() is None:
+            path.unlink(missing_ok=True)
+        write_whole(path, mark.model_dump_json().encode(), once=True)
         return self.farm() or mark.id
 
     def farm(self) -> str | None:
@@ -168,8 +169,8 @@ class Store:
     def create(self, job: Job, wish: Wish) -> bool:
         """Keeps a new job; False where one of its id is there already."""
         folder = self._folder(job.id)
-        if not (folder / "state.json").exists():
-            self.wish(job.id, wish)
+        # Of several who make it at once, the wish of the first holds.
+        write_whole(folder / "state.json", wish.model_dump_json().encode(), once=True)
         return write_whole(folder / "job.json", job.model_dump_json().encode(), once=True)
 
     def job(self, job_id: str) -> Job | None:

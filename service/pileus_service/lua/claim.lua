@@ -192,9 +192,12 @@ end
 hand_back_unheard()
 look_around()
 greet(worker, info)
--- Where its data folder is another, or is not mounted, it would fail whatever it took.
+-- Where its data folder is another, or is not mounted, it would fail whatever it took. While it still
+-- starts it may have looked there before the service began the farm.
 local ours = redis.call('GET', 'pileus:farm')
-if ours and ours ~= farm then trouble = "its data folder is not the farm's: is it mounted?" end
+if able == '1' and ours and ours ~= farm then
+  trouble = "its data folder is not the farm's: is it mounted?"
+end
 if trouble ~= '' then set_aside(worker, TROUBLED, trouble) end
 if able ~= '1' or aside(worker) then return nil end
 for priority = 9, 0, -1 do
