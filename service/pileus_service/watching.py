@@ -16,8 +16,8 @@ from pileus_service.terminal import describe, in_flight
 def wait_for(client: Client, job: JobView) -> JobView:
     """Shows a job until it ends, its frames in flight below it; returns it as it ended."""
     with Display() as display:
-        display.note(f"{job.id}: taken")
         try:
+            display.note(f"{job.id}: taken")
             for view in client.watch(job.id):
                 job = view
                 whole = Row(job.name, job.progress, describe(job))
