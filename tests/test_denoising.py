@@ -115,7 +115,7 @@ def test_a_plain_sky_is_left_as_it_is_and_what_stands_in_it_is_the_same_anywhere
         color, guide = (np.tile(of, (100, 90, 1)).astype(np.float32) for of in (sky, [0.5] * 3))
         place = np.s_[row : row + 30, column : column + 21]
         color[place], guide[place] = noise, 1.0
-        found = Filter(2)({"color": color, "albedo": guide}, "FAST")
+        found = Filter(2)({"albedo": guide, "color": color}, "FAST")
         filtered.append(found[place].copy())
         found[place] = color[place]
         np.testing.assert_array_equal(found, color)

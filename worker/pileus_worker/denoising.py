@@ -79,7 +79,8 @@ class Filter:
         """Filters a linear `color` of any range with the guides `albedo` and `normal`, or a guide
         alone. All are of shape (height, width, 3 or more) and their first three channels count;
         returns (height, width, 3). Raises FarmError."""
-        filtered: Pixels = next(iter(images.values()))[..., :3].copy()
+        [alone, *_] = images.values()
+        filtered: Pixels = images.get("color", alone)[..., :3].copy()
         part = _uneven(images.values())
         if all(side.start < side.stop for side in part):
             margins = [_margins(side) for side in part]

@@ -1,7 +1,7 @@
 -- The jobs ARGV[2], ARGV[3], ... as they stand, in one reply of JSON: the time, and of each job its
 -- fields, how many frames have failed, the first of them and why, how many wait for their caches, what
--- workers have in hand, and the frames under way, each with its fields; false for a job that is not here. Hundreds of small replies
--- would cost their reader far more than they cost Redis.
+-- workers have in hand, and the frames under way, each with its fields; false for a job that is not
+-- here. Hundreds of small replies would cost their reader far more than they cost Redis.
 local jobs = {}
 for number = 2, #ARGV do
   local key = job_of(ARGV[number])
